@@ -1,4 +1,4 @@
-"""Monocular priors that err as networks do, made from true depth, and rooms that need them."""
+"""Simulated monocular priors with errors like those of networks, and rooms that need them."""
 
 import math
 from collections.abc import Iterable
@@ -18,26 +18,26 @@ from geogs_synth.textures.patterns import fractal_noise
 
 @dataclass(frozen=True)
 class PriorErrors:
-    """How far a made-up prior is from the truth. Every image has its own random errors."""
+    """Errors of a simulated prior. Every image has its own random errors."""
 
     scale: float = 0.3
-    """Deviation of the logarithm of the factor common to an image."""
+    """Standard deviation of the logarithm of the factor common to an image."""
     shift: float = 0.1
-    """Deviation of its shift, in parts of the median, where the kind has one."""
+    """Standard deviation of its shift, as a fraction of the median, if the kind has one."""
     warp: float = 0.08
-    """Deviation of the logarithm of a smooth factor that varies over the image."""
+    """Standard deviation of the logarithm of a smooth factor that varies over the image."""
     warp_cells: int = 2
-    """Waves of that factor across the image, about."""
+    """Approximate number of waves of that factor across the image."""
     noise: float = 0.02
-    """Relative deviation of what varies from pixel to pixel."""
+    """Relative standard deviation of the pixels' independent noise."""
     blur: float = 0.008
-    """Deviation of the blur at depth edges, of the long edge."""
+    """Standard deviation of the blur at depth edges, as a fraction of the long edge."""
     wrong_share: float = 0.0
-    """Part of the image, in random places, whose depth is wrong."""
+    """Fraction of the image, in random regions, whose depth is wrong."""
     wrong_factor: float = 2.5
     """Largest factor there, up or down; the least is two."""
     turn: float = 0.12
-    """Deviation of the normals' direction, radians, smooth over the image."""
+    """Standard deviation of the normals' direction, radians, smooth over the image."""
 
 
 PLAUSIBLE = PriorErrors()
@@ -45,11 +45,11 @@ PLAUSIBLE = PriorErrors()
 PATCHY = PriorErrors(wrong_share=0.12)
 """Equally plausible, but wrong by a factor of two and more in an eighth of the image."""
 BAD = PriorErrors(warp=0.2, noise=0.05, wrong_share=0.35)
-"""Wrong by a factor of two and more in a third of the image, elsewhere in every image."""
+"""Wrong by a factor of two and more in a third of the image, a different one in every image."""
 
 
 class DegradedPrior:
-    """A prior that knows the true views of some images and spoils them."""
+    """A prior that returns the true maps of some images with errors."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class DegradedPrior:
         self._errors, self._kind, self._seed = errors, kind, seed
 
     def predict(self, image: UInt8[np.ndarray, "h w 3"]) -> PriorMaps:
-        """Spoiled depth and normals of an image that is among the known ones."""
+        """Depth and normals, with errors, of one of the known images."""
         number, view = self._views[image.tobytes()]
         rng = np.random.default_rng([self._seed, number, 0x9E1])
         depth = torch.from_numpy(self._depth(view.depth, rng))
@@ -89,7 +89,7 @@ class DegradedPrior:
     def _wrong(
         self, shape: tuple[int, int], rng: np.random.Generator
     ) -> Float32[np.ndarray, "h w"]:
-        """Logarithm of the factor of the wrong places, 0 elsewhere."""
+        """Logarithm of the factor in the wrong regions, 0 elsewhere."""
         if self._errors.wrong_share <= 0:
             return np.zeros(shape, np.float32)
         place = fractal_noise(rng, shape, (3, 4), 2)
@@ -109,7 +109,7 @@ class DegradedPrior:
 
 
 def with_bare_walls(scene: Scene) -> Scene:
-    """The same room with its walls painted in one colour each, so that they have no texture."""
+    """The same room with each wall in one colour, without texture."""
     s = scene.solids
     rectangle = (s.kind == BOX) & (s.half[:, 2] == 0)
     upright = np.abs(s.rotation[:, 2, 2]) < 0.5

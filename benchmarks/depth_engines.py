@@ -2,8 +2,8 @@
 
     python benchmarks/depth_engines.py [--rooms 3] [--keyframes 3] [--width 320] [--device cpu]
 
-Rooms are those of ``geogs synth``, which the network's training never shows, with the noise of a
-camera; once as they are, once with most of their materials of one colour. Poses are as wrong as the
+Rooms are those of ``geogs synth``, which the network's training never uses, with the noise of a
+camera; once unchanged, once with most of their materials of one colour. Poses have errors like the
 tracker's, whose depth is simulated: right to 3 % where there is texture, elsewhere a guess.
 """
 
@@ -36,13 +36,13 @@ from geogs_train.depth.depth_scores import KINDS, texture_kind
 STEP = 6
 """Frames between keyframes: 0.2 s."""
 AROUND = 4
-"""Keyframes before and after one from which its neighbours are chosen."""
+"""Number of keyframes before and after one from which its neighbours are chosen."""
 NOISE = 1.5
 """Noise of the images, grey levels."""
 SHIFT, TURN = 0.001, 0.02
-"""Deviation of the positions along each axis, metres, and of the rotations, degrees."""
+"""Standard deviations of the positions along each axis, metres, and of the rotations, degrees."""
 FLAT = 0.8
-"""Share of the materials that are of one colour in the second set."""
+"""Fraction of the materials that are of one colour in the second set."""
 COLUMNS = (
     "engine",
     "surface",
@@ -60,7 +60,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What an engine is given, and the truth at the size of the render."""
+    """Input of an engine, and the truth at the size of the render."""
 
     view: DepthView
     depth: np.ndarray
@@ -70,20 +70,20 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Found:
-    """Pixels of one engine, a row each."""
+    """Errors of the pixels of one engine, one row each."""
 
     error: np.ndarray
-    """Relative, of depth."""
+    """Relative error of depth."""
     confidence: np.ndarray
     angle: np.ndarray
-    """Between true normals and those of the depth, degrees."""
+    """Angle between true normals and those of the depth, degrees."""
     own_angle: np.ndarray
-    """The same of the engine's own normals; nan without."""
+    """The same for the engine's own normals; nan without them."""
     kind: np.ndarray
 
 
 def flattened(scene: Scene, seed: int) -> Scene:
-    """Most of the materials are of one colour."""
+    """Give most of the materials one colour."""
     rng = np.random.default_rng([seed, 17])
     textures = tuple(
         replace(t, image=np.full_like(t.image, t.image.mean((0, 1)))) if rng.random() < FLAT else t
@@ -95,7 +95,7 @@ def flattened(scene: Scene, seed: int) -> Scene:
 def shoot(
     caster: Raycaster, T_wc: np.ndarray, number: int, working: Camera, render: Camera
 ) -> Keyframe:
-    """One keyframe of a room."""
+    """Render one keyframe of a room."""
     rng = np.random.default_rng([number, 5])
     fine, coarse = caster.render(working, T_wc), caster.render(render, T_wc)
     noisy = fine.image + rng.normal(0, NOISE, fine.image.shape)
@@ -118,14 +118,14 @@ def shoot(
 
 
 def neighbours_of(keyframes: Sequence[Keyframe], index: int, render: Camera) -> list[int]:
-    """The neighbours that the mapper would choose."""
+    """Neighbours by the mapper's selection."""
     typical = float(np.median(keyframes[index].depth))
     views = [k.view for k in keyframes]
     return select_sweep_neighbours(views[index], views, typical, render)
 
 
 def compare(keyframe: Keyframe, dense: DenseDepth, render: Camera) -> Found:
-    """Pixels of one keyframe that show something."""
+    """Errors of the pixels of one keyframe with known depth."""
     found = dense.arrays()
     normal, valid = normals_from_depth(torch.from_numpy(found.depth), render)
     known = (keyframe.depth > 0) & valid.numpy()
@@ -139,14 +139,14 @@ def compare(keyframe: Keyframe, dense: DenseDepth, render: Camera) -> Found:
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Degrees; nan where the first is no normal."""
+    """Angle in degrees; nan where the first is no normal."""
     cosine = (first * second).sum(-1)
     known = np.linalg.norm(first, axis=-1) > 0.5
     return np.where(known, np.degrees(np.arccos(np.clip(cosine, -1, 1))), np.nan)
 
 
 def report(name: str, parts: Sequence[Found], seconds: float) -> None:
-    """A row for each kind of surface, and one for all."""
+    """Print a row for each kind of surface, and one for all."""
     names = [f.name for f in fields(Found)]
     everything = Found(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
     for kind in (None, *range(len(KINDS))):
@@ -178,7 +178,7 @@ def searched(
     checked: bool,
     render: Camera,
 ) -> tuple[DenseDepth, float]:
-    """The depth of a keyframe and the seconds of its search; ``checked`` by its neighbours'."""
+    """The depth of a keyframe, if ``checked`` by its neighbours', and the seconds of its search."""
     chosen = neighbours_of(keyframes, index, render)
 
     def search(at: int) -> DenseDepth:

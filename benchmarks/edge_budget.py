@@ -1,12 +1,12 @@
-"""Where depth at edges, of thin things and behind them is lost between the search and the mesh.
+"""Error budget of depth at edges, of thin things and behind them, from the search to the mesh.
 
     python benchmarks/edge_budget.py SEQUENCE [--every 3] [--long-edge 320] [--steps 600] [OPTIONS]
 
 SEQUENCE is a folder in Replica layout with exact depth images (geogs synth; best with
 --flaws.readout 0, as the rows of a rolling shutter have other poses). Every third frame is a
 keyframe with its true pose. Their depths are searched, checked, made disks, trained and fused as
-in a run, and after each step judged from the keyframes as geogs bench edges judges the mesh; beside
-that exact depths are fused, and disks trained on them. OPTIONS are those of geogs run
+in a run, and after each step scored from the keyframes like the mesh in geogs bench edges. For
+comparison exact depths are fused, and disks trained on them. OPTIONS are those of geogs run
 (--mapping.loss.edge-factor 40). Percent of the pixels of a kind: right within 2 / 5 %, in front by
 more than 5 %, missing.
 """
@@ -42,7 +42,7 @@ KINDS = ("all", "open", "edge", "thin", "behind thin")
 WINDOW, TOLERANCE = 7, 0.003
 """Window and tolerance of the planes of true depths, as in ``geogs bench edges``."""
 RASTER = 8
-"""Pixels from one true point to the next, of those that say between which depths to search."""
+"""Pixels between the true points that set the range of the depth search."""
 
 Maps = Sequence[tuple[Tensor, Tensor]]
 """Depth in map units and weight of each keyframe."""
@@ -50,19 +50,19 @@ Maps = Sequence[tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True)
 class Keyframes:
-    """The keyframes of a sequence at their true poses, and how their depths are judged."""
+    """The keyframes of a sequence at their true poses, with the scoring of their depths."""
 
     camera: Camera
     judged: list[ComparedView]
     poses: list[Tensor]
     """World to camera, metres."""
     points: Float64[np.ndarray, "n 3"]
-    """Some of what they see, metres."""
+    """Some of the points that they see, metres."""
     frame: MapFrame
 
     @staticmethod
     def read(sequence: Path, every: int, long_edge: int) -> "Keyframes":
-        """Every so many-th frame, as large as that."""
+        """Read every ``every``-th frame, at this size."""
         source = open_source(sequence, InputConfig(long_edge=long_edge, depth="auto"))
         truth, judged, poses, points = read_replica_trajectory(sequence / "traj.txt"), [], [], []
         camera = source.camera
@@ -88,7 +88,7 @@ class Keyframes:
         return [(depth / self.frame.unit).float() for depth in depths]
 
     def mapper(self, config: Config) -> Mapper:
-        """A map of none of them yet, which knows between which depths to search."""
+        """Make a mapper without disks yet, with the range of the depth search."""
         keyframes = KeyframeTable.on(SampleGrid(self.camera)).new_set()
         mapper = Mapper(keyframes.table, config.mapping, config.seed)
         if mapper.cameras.render.width != self.camera.width:
@@ -102,7 +102,7 @@ class Keyframes:
         return mapper
 
     def report(self, name: str, found: Sequence[Float32[np.ndarray, "h w"]]) -> None:
-        """Print what is right of depths in map units, 0 or infinite where there is none."""
+        """Print the scores of depths in map units, 0 or infinite where there is none."""
         views = []
         for view, depth in zip(self.judged, found, strict=True):
             metres = np.where(depth > 0, depth * self.frame.unit, np.inf).astype(np.float32)
@@ -115,7 +115,7 @@ class Keyframes:
         print(f"{name:24s}| " + " | ".join(cells), flush=True)
 
     def fuse(self, name: str, maps: Maps, mapper: Mapper, config: Config) -> None:
-        """Print what is right of the mesh of depth maps, from the keyframes."""
+        """Print the scores of the mesh of depth maps, from the keyframes."""
         poses = [view.T_cw for view in mapper.views.values()]
         views = [
             DepthMapView(depth, weight, self.camera, T_cw, None)
@@ -127,7 +127,7 @@ class Keyframes:
 
 
 def train(keyframes: Keyframes, name: str, mapper: Mapper, config: Config, steps: int) -> None:
-    """Disks of the depths that there are, and their mesh."""
+    """Make and train disks of the mapper's depths, and print the scores of them and their mesh."""
     mapper.grow()
     keyframes.report(f"{name}: new disks", [r.depth.numpy() for r in mapper.renders()])
     mapper.train(steps)
@@ -137,7 +137,7 @@ def train(keyframes: Keyframes, name: str, mapper: Mapper, config: Config, steps
 
 
 def main() -> None:
-    """See the module's text."""
+    """Run the benchmark."""
     from geogs.cli.run import parse
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -1,4 +1,4 @@
-"""What fleets cost, and what they gain: `geogs fleet` measured on one machine.
+"""Cost and gain of fleets: `geogs fleet` measured on one machine.
 
     python benchmarks/fleet.py overhead [--rooms 16] [--cores 2]
     python benchmarks/fleet.py tiny [--sources 1000]
@@ -6,11 +6,11 @@
     python benchmarks/fleet.py gpus [--rooms 12] [--share 0.25]
     python benchmarks/fleet.py join [--walk 5000] [--every 2] [--parts 10]
 
-Respectively: rooms as a fleet against a loop of the shell; what scheduling alone takes; nodes lost
+Respectively: rooms as a fleet against a loop of the shell; the time of scheduling alone; nodes lost
 at random; rooms a minute on one GPU and on all; a walk in overlapping parts against one run.
 Each prints lines of JSON. Rooms are short sequences of `geogs synth`, the walk is that of
 `long_walk.py`; both are rendered first, into ``--folder``. Sources of `tiny` and `kills` are
-computed by a stand-in that ends at once, or takes three seconds in steps that it keeps.
+computed by a stand-in that ends at once, or takes three seconds in steps that it saves.
 """
 
 import argparse
@@ -45,10 +45,10 @@ GEOGS = (sys.executable, "-m", "geogs.cli.main")
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 STAND_IN = (sys.executable, str(TESTS / "fleet" / "fake_child.py"))
 STEPS = 15
-"""Steps of a source of `kills`, of 0.2 s each."""
+"""Number of steps of a source of `kills`, of 0.2 s each."""
 FRAMES_A_SECOND = 30.0
 _NEAREST = 0.2
-"""Metres from a vertex to a point that was seen, at most, for it to be judged."""
+"""Largest distance of a scored vertex to a point that was seen, metres."""
 
 
 def main() -> None:
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def overhead(options: argparse.Namespace) -> None:
-    """Rooms as a fleet, and as a loop that starts the next when one ends, both one on each core."""
+    """Time rooms as a fleet, and as a loop that starts the next when one ends; one on each core."""
     rooms = rendered_rooms(options)
     out = options.folder / "overhead"
     alone = ["--device", "cpu", "--preset", options.preset]
@@ -94,7 +94,7 @@ def overhead(options: argparse.Namespace) -> None:
 
 
 def tiny(options: argparse.Namespace) -> None:
-    """Sources that end at once: seconds from one to the next, and the driver's processor and
+    """Measure seconds between sources that end at once, and the driver's processor time and
     memory."""
     given = texts(options.folder / "tiny", options.sources, "ok")
     settings = FleetOptions((str(given),), output=str(options.folder / "tiny-out"), gpus=0.0)
@@ -112,7 +112,7 @@ def tiny(options: argparse.Namespace) -> None:
 
 
 def kills(options: argparse.Namespace) -> None:
-    """Nodes are lost at random times while sources are computed, and as many come back."""
+    """Kill nodes at random times while sources are computed, and add as many again."""
     sys.path.insert(0, str(TESTS / "fleet"))
     sys.path.insert(0, str(TESTS))
     from cluster_nodes import add_node, simulated_cluster
@@ -127,7 +127,7 @@ def kills(options: argparse.Namespace) -> None:
             gone = nodes.pop(rng.randrange(len(nodes)))
             cluster.remove_node(gone, allow_graceful=False)
             lost += 1
-            nodes.append(add_node(cluster))  # Ray wants this of the main thread
+            nodes.append(add_node(cluster))  # Ray requires the main thread for this
         rows = fleet.result().rows
     steps = [(out / row.name / "steps").read_text().split() for row in rows]
     report(
@@ -138,7 +138,7 @@ def kills(options: argparse.Namespace) -> None:
 
 
 def gpus(options: argparse.Namespace) -> None:
-    """Rooms a minute: on one GPU one at a time and several, on all GPUs likewise."""
+    """Measure rooms a minute, one at a time and several, on one GPU and on all."""
     rooms = rendered_rooms(options)
     count = torch.cuda.device_count()
     ways = [(1, 1.0), (1, options.share)] + [(count, 1.0), (count, options.share)] * (count > 1)
@@ -159,7 +159,7 @@ def gpus(options: argparse.Namespace) -> None:
 
 
 def join(options: argparse.Namespace) -> None:
-    """A walk through many rooms as one run, and as overlapping parts that are joined."""
+    """Compare a walk through many rooms as one run, and as overlapping parts that are joined."""
     suite, camera = Suite.for_walk(options.walk), centred_camera(512, 288)
     images = options.folder / f"{suite.rooms}-rooms"
     frames = range(0, options.walk, options.every)
@@ -196,7 +196,7 @@ def join(options: argparse.Namespace) -> None:
 
 
 def rendered_rooms(options: argparse.Namespace) -> list[Path]:
-    """Rooms of different seeds, as many at a time as there are cores."""
+    """Render rooms of different seeds, as many at a time as there are cores."""
     folder, (width, height) = options.folder / "rooms", map(str, options.size)
     folder.mkdir(exist_ok=True)
     rooms = [folder / f"room{seed:02d}" for seed in range(options.rooms)]
@@ -215,7 +215,7 @@ def rendered_rooms(options: argparse.Namespace) -> list[Path]:
 
 
 def texts(folder: Path, number: int, text: str) -> Path:
-    """Sources of the stand-in, which all say the same."""
+    """Write sources of the stand-in, all with the same text."""
     folder.mkdir(exist_ok=True)
     for n in range(number):
         (folder / f"s{n:04d}.mp4").write_text(text)
@@ -223,7 +223,7 @@ def texts(folder: Path, number: int, text: str) -> Path:
 
 
 def linked(folder: Path, images: Path, frames: range) -> Path:
-    """A folder that shows some of the images."""
+    """Make a folder of links to some of the images."""
     folder.mkdir(exist_ok=True)
     for n in frames:
         link = folder / f"frame{n:06d}.jpg"
@@ -235,7 +235,7 @@ def linked(folder: Path, images: Path, frames: range) -> Path:
 def seen_surface(
     suite: Suite, camera: Camera, options: argparse.Namespace
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals of what one in ten of the walk's frames really see."""
+    """True points and normals that one in ten of the walk's frames see."""
     small = camera.resized(camera.width // 2, camera.height // 2)
     caster = SuiteRaycaster(suite, len(os.sched_getaffinity(0)))
     points, normals = [], []
@@ -279,7 +279,7 @@ def path_errors(output: Path, given: list[range], truth: np.ndarray) -> Trajecto
 
 
 def took(command: list[str], environment: dict[str, str] | None = None) -> float:
-    """Seconds of a command; how it ended is told, not raised."""
+    """Seconds of a command; its exit code is printed, and a failure is not raised."""
     began = time.perf_counter()
     code = subprocess.run(command, env=environment).returncode
     seconds = round(time.perf_counter() - began, 2)
@@ -288,7 +288,7 @@ def took(command: list[str], environment: dict[str, str] | None = None) -> float
 
 
 def most_memory() -> float:
-    """MiB of this process, at most so far."""
+    """Peak memory of this process so far, MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -5,9 +5,9 @@
     python benchmarks/flow.py --data ROOM_DIR [--gaps 5,15,40]     rendered rooms with depth images
 
 ROOM_DIR is in Replica layout with some depth images: every frame that has one is matched with the
-frames before and after it; occlusions are not known there, so medians and shares tell more than
-means. Both operators start from the same disturbed flow ("warm", 0.05 to 16 pixels; "far", 16 to
-64) or from nothing ("cold").
+frames before and after it; occlusions are unknown there, so medians and fractions are more reliable
+than means. Both operators start from the same disturbed flow ("warm", 0.05 to 16 pixels; "far", 16
+to 64) or from zero flow ("cold").
 """
 
 import argparse
@@ -81,7 +81,7 @@ def compare(network: FlowNetwork, batches: Iterable[FlowBatch], name: str, count
 
 
 def on_device(batch: FlowBatch, device: torch.device) -> FlowBatch:
-    """The same on a device."""
+    """Move a batch to a device."""
     edges = Edges(batch.edges.first.to(device), batch.edges.second.to(device))
     moved = {k: v.to(device) for k, v in vars(batch).items() if isinstance(v, torch.Tensor)}
     return FlowBatch(edges=edges, **moved)
@@ -97,7 +97,7 @@ def own_errors(network: FlowNetwork, batch: FlowBatch, iterations: int) -> CellE
 
 
 def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
-    """Errors of the classical operator, on the CPU; edges come as pairs of both directions."""
+    """Errors of the classical operator, on the CPU; edges are pairs of both directions."""
     batch = on_device(batch, torch.device("cpu"))
     height, width = batch.images.shape[-2:]
     grid = SampleGrid(Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=width, height=height))
@@ -123,7 +123,7 @@ def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
 
 
 def data_batches(folder: Path, gaps: list[int], starts: StartOptions) -> Iterator[FlowBatch]:
-    """Frames that have depth with frames before and after them; half of the truth each way."""
+    """Batches of a frame with depth and frames before and after it; truth in one direction only."""
     source = open_source(folder, InputConfig())
     camera, poses = source.camera, read_replica_trajectory(folder / "traj.txt").T_wc
     depths = {int(p.stem[5:]): p for p in (folder / "results").glob("depth*.png")}
@@ -136,7 +136,7 @@ def data_batches(folder: Path, gaps: list[int], starts: StartOptions) -> Iterato
 
 
 def working_depth(depth: np.ndarray, camera: Camera) -> torch.Tensor:
-    """The nearest depth to every pixel's centre."""
+    """Depth nearest to every pixel's centre."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rows = ((v + 0.5) * depth.shape[0] / camera.height - 0.5).round().astype(int)
     columns = ((u + 0.5) * depth.shape[1] / camera.width - 0.5).round().astype(int)
@@ -144,7 +144,7 @@ def working_depth(depth: np.ndarray, camera: Camera) -> torch.Tensor:
 
 
 def pairs_with(index, others, depth, frames, poses, camera, starts, generator) -> FlowBatch:  # type: ignore[no-untyped-def]
-    """Edges from one frame to others, then back; the way back has no truth and is not scored."""
+    """Edges from one frame to others, then back; the back edges have no truth and no score."""
     n, (height, width) = len(others), depth.shape
     images = torch.from_numpy(np.stack([frames[index], *(frames[k] for k in others)]))
     T_cw = se3_inverse(torch.from_numpy(poses[[index, *others]])).float()
@@ -164,7 +164,7 @@ def pairs_with(index, others, depth, frames, poses, camera, starts, generator) -
         truth[at], depth[None][at].expand(n, -1, -1), rays[None][at].expand(n, -1, -1, -1), T, K,
         cells, starts, generator,
     )  # fmt: skip
-    back = 2 * cells - start  # about right, and good enough for what is only a check
+    back = 2 * cells - start  # an approximation, good enough for a check
     zero, k = torch.zeros(n, dtype=torch.int32), torch.arange(1, n + 1, dtype=torch.int32)
     both = [torch.cat([x, torch.zeros_like(x)]) for x in (truth, seen)]
     return FlowBatch(

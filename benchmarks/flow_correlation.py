@@ -1,17 +1,18 @@
-"""How alike the errors of flow are in neighbouring cells and in edges that share an image.
+"""Correlation of the errors of flow in neighbouring cells and in edges with a common image.
 
     python benchmarks/flow_correlation.py [--weights FILE] [--scenes usual,shaken] [--batches 4]
 
-The adjustment takes the errors of cells for independent, of one edge and of several. Where they
-are alike, its deviations have to be larger. Errors over the predicted deviation, z, are compared
-between cells some cells apart and between two edges with the same first image. A mean of n such
-errors has the variance of n / f independent ones, with
+The adjustment assumes that the errors of cells are independent, in one edge and across edges. If
+they are correlated, its standard deviations have to be larger. Errors over the predicted standard
+deviation, z, are compared between cells some cells apart and between two edges with the same first
+image. A mean of n such errors has the variance of n / f independent ones, with
 
     f = (sum over all lags of their correlation in space) * (1 + (E - 1) * correlation over edges)
 
-and the factor on the deviations is sqrt(f var z). The sum stops where the correlation first
-falls below a twentieth; E is the number of edges that a cell has in the tracker. For both operators
-on the same pairs, and for the network where the classical operator has no match or another one.
+and the factor on the standard deviations is sqrt(f var z). The sum stops where the correlation
+first falls below a twentieth; E is the number of edges of a cell in the tracker. Printed for both
+operators on the same pairs, and for the network where the classical operator has no match or a
+different one.
 """
 
 import argparse
@@ -35,11 +36,11 @@ from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
 from geogs_train.flow.starts import StartOptions
 
 EDGES = 6
-"""Edges of a keyframe's cell in the tracker's window, about."""
+"""Approximate number of edges of a keyframe's cell in the tracker's window."""
 LARGEST = 2.0
-"""Pixels by which a start of the tracker is off."""
+"""Largest error of a start of the tracker, pixels."""
 CUT = 4.0
-"""Predicted deviations beyond which an error counts as so many: the adjustment is robust."""
+"""Limit to which errors are clamped, in predicted standard deviations: the adjustment is robust."""
 
 
 def main() -> None:
@@ -95,7 +96,7 @@ def errors(network, batch: FlowBatch, iterations: int) -> dict[str, torch.Tensor
         "classical": z_of(theirs, weight, truth, seen),
         "classical, where joined": z_of(theirs, weight, truth, seen & joined & good.cpu()),
     }
-    # Edges come in the order 0-1, 1-0, 1-2, 2-1, each of all clips.
+    # The order of the edges is 0-1, 1-0, 1-2, 2-1, each of all clips.
     count = len(truth) // 4
     rows = grid.height
     return {
@@ -121,20 +122,20 @@ def classical_matches(grid: SampleGrid, batch: FlowBatch) -> tuple[torch.Tensor,
 
 
 def _ways(edges: torch.Tensor) -> torch.Tensor:
-    """Edges (0-1, 1-0, 1-2, 2-1, each of all clips) by whether they go back."""
+    """Split edges (0-1, 1-0, 1-2, 2-1, each of all clips) into forward and back ones."""
     return edges.reshape(2, 2, -1).transpose(0, 1)
 
 
 def z_of(
     pixels: torch.Tensor, weight: torch.Tensor, truth: torch.Tensor, seen: torch.Tensor
 ) -> torch.Tensor:
-    """Errors over the predicted deviation, cut; NaN where there is none."""
+    """Errors over the predicted standard deviation, clamped; NaN where there is none."""
     z = ((truth - pixels) * weight.sqrt()).clamp(-CUT, CUT)
     return z.masked_fill(~(seen[..., None] & (weight > 0)), torch.nan)
 
 
 def factor(z: torch.Tensor, edges: int) -> str:
-    """What the deviations have to be multiplied with, and what it is made of."""
+    """Text of the factor on the standard deviations, and of its parts."""
     variance = float(z.square().nanmean())
     space, reach = 0.0, 0
     for lag in range(z.shape[3]):

@@ -1,15 +1,15 @@
-"""Time and memory of the global adjustment of a long walk, with matches made up.
+"""Time and memory of the global adjustment of a long walk, with simulated matches.
 
     python benchmarks/global_ba.py [COUNT ...] [--rounds 1] [--iterations 2] [--drift 0.002]
     python benchmarks/global_ba.py --rooms [COUNT ...]
 
-Each number of keyframes (200, 400, 800 and 1600 if none is given) runs in a process of its own:
+Each number of keyframes (200, 400, 800 and 1600 if none is given) runs in its own process:
 the walk of tests/planted_walk.py on a grid of 64 x 36 cells, whose matches cost next to nothing, so
-that the choice of pairs, the graph and the solver are what is measured. Printed are the pairs, the
-seconds to choose them and to do everything, the peak memory above that of the loaded program and
-the error of the poses in cm, before and after. With ``--rooms`` keyframes are spread over the long
-walk through 42 rooms (long_walk.py) and see a depth of 2.2 m everywhere; printed are the pairs, the
-band of the camera system and the seconds of one solution.
+that the choice of pairs, the graph and the solver are measured. Printed are the pairs, the
+seconds to choose them and in all, the peak memory above that of the loaded program and the error of
+the poses in cm, before and after. With ``--rooms`` keyframes are spread over the long walk through
+42 rooms (long_walk.py) and see a depth of 2.2 m everywhere; printed are the pairs, the band of the
+camera system and the seconds of one solution.
 """
 
 import argparse
@@ -46,12 +46,12 @@ def error_cm(tracker: Tracker, truth: torch.Tensor) -> float:
 
 
 def peak() -> float:
-    """Most memory the process has held, MiB."""
+    """Peak memory of the process, MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def measure(count: int, args: argparse.Namespace) -> None:
-    """One walk in this process."""
+    """Adjust one walk in this process."""
     torch.set_num_threads(1)
     settings.ROUNDS, settings.PAIRS = args.rounds, args.pairs
     settings.GLOBAL_OPTIONS = replace(settings.GLOBAL_OPTIONS, iterations=args.iterations)
@@ -72,7 +72,7 @@ def measure(count: int, args: argparse.Namespace) -> None:
 
 
 def through_rooms(count: int) -> None:
-    """Pairs and camera system of a walk through many rooms in this process."""
+    """Measure the pairs and the camera system of a walk through many rooms in this process."""
     torch.set_num_threads(1)
     walk = Suite.for_walk(12_000).walk(20_000, 0.6)
     tracker = lone_tracker(centred_camera(512, 288))
@@ -86,7 +86,7 @@ def through_rooms(count: int) -> None:
     chosen = time.perf_counter() - tick
     edges = torch.tensor(sorted(pairs + [(j, i) for i, j in pairs]))
     system = SparseCameraSystem(edges[:, 0], edges[:, 1], torch.arange(count) > 0)
-    system.add_sums(  # definite, which is all that the time depends on
+    system.add_sums(  # positive definite, which is enough to measure the time
         torch.eye(6, dtype=torch.float64).expand(system.size, 6, 6) / system.size,
         torch.ones(count, 6, dtype=torch.float64),
     )

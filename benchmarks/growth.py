@@ -1,11 +1,11 @@
-"""What single steps of a keyframe cost when there are already many keyframes.
+"""Cost of single steps of a keyframe with many keyframes before it.
 
     python benchmarks/growth.py [--keyframes 100 400 1600] [--size 320 192]
 
-Keyframes of noise along a long winding way, with depth, are given to the mapper and to the search
-of loops without any tracking, so that growth shows within a minute. Printed are CPU milliseconds
-of each step for every number of keyframes, then the last over the first. What does not grow is
-near 1; what looks over all keyframes one by one grows as they do.
+Keyframes of noise along a long winding path, with depth, are given to the mapper and to the loop
+search without any tracking, so that growth shows within a minute. Printed are CPU milliseconds
+of each step for every number of keyframes, then the ratio of the last to the first. A constant cost
+is near 1; a loop over all keyframes grows with their number.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def cost(step: Callable[[], object], times: int = 5) -> float:
-    """CPU milliseconds of this thread, least of some."""
+    """CPU milliseconds of this thread, the least of ``times`` calls."""
     found = []
     for _ in range(times):
         start = time.thread_time()
@@ -61,7 +61,7 @@ def cost(step: Callable[[], object], times: int = 5) -> float:
 
 
 def way(count: int) -> torch.Tensor:
-    """World to camera along a winding way that never comes back."""
+    """World to camera along a winding path that never comes back."""
     t = torch.arange(count, dtype=torch.float64)
     T = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     T[:, :3, :3] = so3_exp(torch.stack([0 * t, 0.6 * torch.sin(t / 7), 0 * t], 1))
@@ -70,7 +70,7 @@ def way(count: int) -> torch.Tensor:
 
 
 def mapping(count: int, size: tuple[int, int]) -> dict[str, float]:
-    """Steps of the mapper, and what the main thread does for the search of loops."""
+    """Cost of the mapper's steps, and of the main thread's part of the loop search."""
     camera, random = centred_camera(*size), np.random.default_rng(0)
     grid = SampleGrid(camera)
     store = KeyframeTable.on(grid, ClassicalFlow(grid).encode, 128)
@@ -99,7 +99,7 @@ def mapping(count: int, size: tuple[int, int]) -> dict[str, float]:
 
 
 def looks(count: int) -> dict[str, float]:
-    """Asking which keyframes look like one, when all words are known."""
+    """Cost of a query for similar keyframes, when all words are known."""
     random, index = np.random.default_rng(0), AppearanceIndex()
     words = random.integers(0, 256, (2000, 32), dtype=np.uint8)
 
@@ -115,7 +115,7 @@ def looks(count: int) -> dict[str, float]:
 
 
 def closing(count: int) -> dict[str, float]:
-    """Voting on loops and adjusting the pose graph, of a ring that is gone round twice."""
+    """Cost of voting on loops and of the pose graph, for a ring walked twice."""
     start, relative = ring(count)
     kept = consistent_loops(start, relative)
     graph = PoseGraph(start, relative.select(kept), torch.arange(count) < 1)
@@ -126,7 +126,7 @@ def closing(count: int) -> dict[str, float]:
 
 
 def ring(count: int) -> tuple[torch.Tensor, RelativePoses]:
-    """Poses that odometry gives, and all relative poses."""
+    """Poses by odometry, and all relative poses."""
     random, lap = torch.Generator().manual_seed(0), count // 2
     angle = 2 * np.pi * torch.arange(count, dtype=torch.float64) / lap
     T = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)

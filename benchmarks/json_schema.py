@@ -1,4 +1,4 @@
-"""Is a value what a JSON schema says? The words of draft 2020-12 that docs/*.schema.json use."""
+"""Validation by a JSON schema, for the keywords of draft 2020-12 in docs/*.schema.json."""
 
 import math
 import re
@@ -16,9 +16,9 @@ _TYPES: Mapping[str, Any] = {
 
 
 def faults(value: Any, schema: Mapping[str, Any], at: str = "$", root: Any = None) -> Iterator[str]:
-    """Sentences on what is not as the schema says; none if all is.
+    """Yield a sentence for each violation of the schema.
 
-    Raises ValueError for a schema with words that are not looked at here.
+    Raises ValueError for a schema with unsupported keywords.
     """
     root = schema if root is None else root
     if "$ref" in schema:

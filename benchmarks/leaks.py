@@ -1,12 +1,12 @@
-"""The same run again and again in one process: growth of its memory and of its open files.
+"""Repeated runs in one process: growth of its memory and of its open files.
 
     python benchmarks/leaks.py VIDEO [--repeats 8] [--minutes 60] [--folder FOLDER]
 
 Prints a line of JSON: frames of a run; after each, bytes in use, resident bytes and open files;
 bytes that are lost a frame (the slope of those in use after the first two runs, in which kernels
-are compiled and pools are filled), files that stay open. Ends with 1 where 1 kB a frame or a file
-is lost. In use is what was asked of the C library and not given back, by Python as well; resident
-is also what the library keeps for later, which grows for some ten runs and tells nothing.
+are compiled and pools are filled), files that stay open. Ends with 1 if 1 kB a frame or a file is
+lost. In use are bytes allocated from the C library and not freed, also by Python; resident bytes
+include the library's free memory, which grows for some ten runs and is no leak.
 """
 
 import argparse
@@ -26,13 +26,13 @@ from geogs.application.run_settings import RunSettings
 from geogs.config import preset
 
 MOST_LEAKED = 1024.0
-"""Bytes a frame."""
+"""Largest accepted loss, bytes a frame."""
 WARM_UP = 2
-"""Runs before memory counts."""
+"""Number of first runs that are not counted."""
 
 
 class MallocInfo(ctypes.Structure):
-    """What the C library says of its memory (``mallinfo2`` of glibc 2.33)."""
+    """Memory statistics of the C library (``mallinfo2`` of glibc 2.33)."""
 
     _fields_ = [
         (name, ctypes.c_size_t)
@@ -44,8 +44,8 @@ class MallocInfo(ctypes.Structure):
 
 
 def main() -> None:
-    """The repetitions, then the line."""
-    if os.environ.get("PYTHONMALLOC") != "malloc":  # which Python takes when it starts
+    """Run the repetitions and print the line."""
+    if os.environ.get("PYTHONMALLOC") != "malloc":  # Python reads it when it starts
         os.environ["PYTHONMALLOC"] = "malloc"
         os.execv(sys.executable, [sys.executable, *sys.argv])
     parser = argparse.ArgumentParser(description=__doc__)
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def repetitions(video: Path, folder: Path, repeats: int, seconds: float) -> dict[str, object]:
-    """Run so often, or as often as there is time for; what grew, none where that was too few."""
+    """Run ``repeats`` times, or as often as time allows; return the growth, none after too few."""
     used, resident, files = list[int](), list[int](), list[int]()
     frames, end = 0, time.monotonic() + seconds
     for _ in range(repeats):
@@ -89,7 +89,7 @@ def repetitions(video: Path, folder: Path, repeats: int, seconds: float) -> dict
 
 
 def bytes_in_use() -> int:
-    """Bytes that are allocated."""
+    """Allocated bytes."""
     tell = ctypes.CDLL(None).mallinfo2
     tell.restype = MallocInfo
     info = tell()

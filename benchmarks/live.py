@@ -1,11 +1,11 @@
-"""How long ``Slam.process`` takes while the map is trained beside it, at a camera's pace.
+"""Latency of ``Slam.process`` during concurrent training of the map, at a camera's frame rate.
 
     python benchmarks/live.py SEQUENCE --device cuda [--fps 30] [--stop 900] [--seconds 60]
 
 A frame is due every 1/fps seconds; one that comes while the frame before it is still tracked is
-dropped, as a live source drops it. Frames up to the first pose, and for ``--warm`` seconds after
-it, are left out: kernels are loaded and compiled then. What the stages took in the slowest frames
-tells where the time went.
+dropped, as by a live source. Frames up to the first pose, and for ``--warm`` seconds after it, are
+left out: kernels are loaded and compiled then. The stages of the slowest frames show where their
+time went.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import geogs
 from geogs.config import InputConfig
 
 LIMITS = 0.033, 0.050
-"""Seconds that are to be kept to in 99 of 100 frames: the aim, and what is asked at least."""
+"""Limits in seconds for 99 of 100 frames: the aim, and the least requirement."""
 
 
 def main() -> None:
@@ -70,9 +70,9 @@ def play(
     warm: float,
     profile: cProfile.Profile | None = None,
 ) -> dict[str, object]:
-    """Feed frames when they are due, drop those that come too soon; what came of it.
+    """Feed frames when they are due, drop those that come too soon; return the results.
 
-    The profile is of the calls that are counted, in this thread alone.
+    The profile covers the counted calls, in this thread alone.
     """
     took: list[float] = []
     stages: list[dict[str, float]] = []
@@ -134,14 +134,14 @@ def play(
 
 
 def kind(stages: dict[str, float], has_keyframe: bool) -> str:
-    """What a frame was: one that waited for a keyframe to be completed, became one, or neither."""
+    """Kind of a frame: it waited for a keyframe to be completed, became one, or neither."""
     if stages.get("waiting", 0.0) > 0.001:
         return "waited"
     return "keyframe" if has_keyframe else "neither"
 
 
 def by_kind(ms: np.ndarray, kinds: list[str]) -> dict[str, list[float]]:
-    """Percentiles and number of the frames of each kind."""
+    """Percentiles and number of frames of each kind."""
     found = {}
     for name in sorted(set(kinds)):
         of = ms[np.array(kinds) == name]

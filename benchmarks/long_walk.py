@@ -5,15 +5,14 @@
         [--pace 1]
 
 The walk is rendered once for all runs into ``--folder``, in another process before the whole system
-follows it, or by several ``--renderers`` that keep ahead of it;
-reading images, and waiting for them, does not count. Printed are, for every 500 frames, the
-milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
-disks; then how long after the last frame each part of what follows begins, until there is a mesh;
-then, stage by stage and for memory, the last 500 frames against the first, and the
-trajectory errors. ``--walk`` keeps the rooms of a longer walk of which only the beginning is
-followed. At half the ``--pace`` the camera goes half as far with each frame, through half as many
-rooms. With fewer ``--images`` than frames the walk goes back the way it came, and so on.
-``--seconds`` ends it early, with what there is then.
+runs on it, or by several ``--renderers`` that stay ahead of it; reading images, and waiting for
+them, does not count. Printed are, for every 500 frames, the milliseconds per keyframe of each
+stage, the memory of the process (and of the GPU), keyframes and disks; then the start of each later
+part, up to the mesh, in seconds after the last frame; then, stage by stage and for memory, the last
+500 frames against the first, and the trajectory errors. ``--walk`` keeps the rooms of a longer walk
+of which only the beginning is used. At half the ``--pace`` the camera moves half as far with each
+frame, through half as many rooms. With fewer ``--images`` than frames the walk goes back and forth.
+``--seconds`` ends it early, with the results up to then.
 """
 
 import argparse
@@ -43,34 +42,34 @@ from portals import SuiteRaycaster
 from suite import Suite
 
 _PATIENCE = 600
-"""Seconds for which the next image is awaited."""
+"""Longest wait for the next image, seconds."""
 _TOGETHER = 100
-"""Frames in a row by one of several renderers: they keep a few rooms in memory, and the system does
-not wait for what comes much later."""
+"""Consecutive frames of one of several renderers: each keeps few rooms in memory, and the next
+frames are finished first."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """What some frames cost."""
+    """Cost of a block of frames."""
 
     frames: int
-    """Seen at the end."""
+    """Number of frames at its end."""
     keyframes: int
     disks: int
     stages: dict[str, float]
     """Milliseconds per new keyframe."""
     total: float
-    """Their sum."""
+    """Sum over the stages."""
     per_frame: float
-    """Milliseconds per frame: there are more keyframes where more is seen for the first time."""
+    """Milliseconds per frame: there are more keyframes where more of the scene is new."""
     processor: float
-    """Milliseconds of all CPU threads per new keyframe, whatever else the machine did."""
+    """Milliseconds of all CPU threads per new keyframe, independent of the machine's load."""
     resident: float
-    """Gigabytes of the process at the end."""
+    """Memory of the process at the end, gigabytes."""
     peak: float
-    """Gigabytes, most so far."""
+    """Peak memory so far, gigabytes."""
     gpu: float
-    """Gigabytes allocated at most within the block."""
+    """Peak memory of the GPU within the block, gigabytes."""
     lost: int
 
 
@@ -159,8 +158,8 @@ def render(
     suite: Suite, camera: Camera, folder: Path, frames: Sequence[int],
     sharing: int = 1, pace: float = 1.0,
 ) -> None:  # fmt: skip
-    """Write those of these frames that are not there yet, by one of so many processes that share
-    the cores."""
+    """Write the missing ones of these frames, in one of ``sharing`` processes that share the
+    cores."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"frame{n:06d}.jpg" for n in frames]
     if all(path.exists() for path in paths):
@@ -180,7 +179,7 @@ def write(path: Path, image: np.ndarray) -> None:
 
 
 def read(path: Path) -> np.ndarray:
-    """An image as soon as it is rendered."""
+    """Read an image as soon as it is rendered."""
     begin = time.perf_counter()
     while not path.exists():
         if time.perf_counter() - begin > _PATIENCE:
@@ -190,7 +189,7 @@ def read(path: Path) -> np.ndarray:
 
 
 def to_and_fro(n: int, images: int) -> int:
-    """Which image frame n of a walk shows that turns back where the images end."""
+    """Index of the image of frame n in a walk that turns back at either end of the images."""
     period = max(2 * (images - 1), 1)
     return min(n % period, period - n % period)
 
@@ -200,7 +199,7 @@ def last_against_first(
 ) -> dict[str, list[float | None]]:
     """Milliseconds per keyframe of each stage in the first and the last block, and their ratio.
 
-    There is none for a stage that was not there at first.
+    The ratio is none for a stage that was not there at first.
     """
     both = {k: (first.get(k, 0.0), v) for k, v in last.items()}
     return {k: [a, b, round(b / a, 2) if a else None] for k, (a, b) in both.items()}
@@ -209,7 +208,7 @@ def last_against_first(
 def follow(
     slam: Slam, folder: Path, images: list[int], every: int, seconds: float | None
 ) -> list[Block]:
-    """Feed the frames and take stock of every so many, and when the time is up."""
+    """Feed the frames and measure every block of them, and the last one when the time is over."""
     blocks: list[Block] = []
     before, known, lost, status, spent = {}, 0, 0, None, 0.0
     end, frames = time.perf_counter() + (seconds or float("inf")), len(images)
@@ -222,7 +221,7 @@ def follow(
         is_late = time.perf_counter() > end
         if (n + 1) % every and n + 1 < frames:
             if is_late:
-                break  # a block that was cut short says less than the last whole one
+                break  # an incomplete block is less reliable than the last complete one
             continue
         now = dict(slam.stopwatch.seconds)
         fresh = max(status.keyframes - known, 1)
@@ -245,7 +244,7 @@ def follow(
 
 
 def memory(field: str) -> float:
-    """Gigabytes of this process: VmRSS now, VmHWM at most."""
+    """Memory of this process in gigabytes: VmRSS now, VmHWM at its peak."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field):
             return round(int(line.split()[1]) * 1024 / 1e9, 3)
@@ -253,7 +252,7 @@ def memory(field: str) -> float:
 
 
 class Clock:
-    """Progress of what follows the video: prints when each part begins."""
+    """Progress of the stages after the video: prints when each begins."""
 
     def __init__(self, start: float) -> None:
         self.start, self.known = start, ""

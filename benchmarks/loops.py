@@ -3,12 +3,12 @@
     python benchmarks/loops.py FOLDER[:POINTS.ply] ... [--every 5] [--long-edge 512] [--drift 1]
 
 Each FOLDER is in Replica or 7-Scenes layout. POINTS.ply holds points of the visible
-surface; without it, points_seen_1cm.ply or tsdf_pseudo_gt.ply of the folder is taken. No tracker
+surface; without it, points_seen_1cm.ply or tsdf_pseudo_gt.ply of the folder is used. No tracker
 runs: keyframes are every n-th frame with depth from the points (3 % smooth error) and true poses
 with a drift (a random walk of 0.3 degrees, 4 mm and 1 % scale per keyframe, times --drift). Ground
-truth says which pairs show the same surface (at least 30 % of both images) and whether a relative
-pose is right (5 degrees, 10 % of the median depth: all loops of 7-Scenes differ from its poses by
-2 to 3 degrees and 6 to 10 cm, alike).
+truth determines which pairs show the same surface (at least 30 % of both images) and whether a
+relative pose is right (5 degrees, 10 % of the median depth: all loops of 7-Scenes differ from its
+poses alike, by 2 to 3 degrees and 6 to 10 cm).
 """
 
 import argparse
@@ -40,7 +40,7 @@ from sequences import load
 
 OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 5.0, 0.1
 SIMILAR = 30.0
-"""Degrees within which two directions count as similar."""
+"""Largest angle between similar directions, degrees."""
 
 
 @dataclass
@@ -50,36 +50,36 @@ class Clock:
     spent: dict[str, list[float]] = field(default_factory=dict)
 
     def __call__(self, name: str, work: Callable[[], Any]) -> Any:
-        """Do the work and remember how long it took."""
+        """Do the work and store its time."""
         start = time.process_time()
         out = work()
         self.spent.setdefault(name, []).append(1e3 * (time.process_time() - start))
         return out
 
     def report(self) -> str:
-        """Mean per call."""
+        """Text of the mean time per call."""
         return ", ".join(f"{k} {np.mean(v):.1f}" for k, v in self.spent.items())
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What really is."""
+    """Ground truth of the keyframes."""
 
     T_cw: torch.Tensor
     depth: torch.Tensor
     """(n, p) on the grid, metres; inf where empty."""
     overlap: np.ndarray
-    """(n, n) share of the cells of both images that show the same surface."""
+    """(n, n) fraction of the cells of both images that show the same surface."""
     scale: np.ndarray
-    """Drifted lengths per metre of each keyframe."""
+    """Drifted units per metre at each keyframe."""
 
     def turn(self, first: int, second: int) -> float:
-        """Degrees between two orientations."""
+        """Angle between two orientations, degrees."""
         R = self.T_cw[second][:3, :3] @ self.T_cw[first][:3, :3].mT
         return float(torch.rad2deg(so3_log(R).norm()))
 
     def right(self, first: int, second: int, T_ji: torch.Tensor) -> bool:
-        """Whether a relative pose, in the drifted lengths of the first, is right."""
+        """Whether a relative pose, in the drifted unit of the first, is right."""
         true = self.T_cw[second] @ se3_inverse(self.T_cw[first])
         turn = float(torch.rad2deg(so3_log(T_ji[:3, :3] @ true[:3, :3].mT).norm()))
         shift = float((T_ji[:3, 3] / self.scale[first] - true[:3, 3]).norm())
@@ -101,7 +101,7 @@ def depths(points: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarray
 
 
 def overlaps(depth: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarray:
-    """Share of the cells of both images that show the same surface, for all pairs."""
+    """Fraction of the cells of both images that show the same surface, for all pairs."""
     n, cam, rays = len(depth), grid.camera, grid.rays.double().numpy()
     seen = np.zeros((n, n))
     for i in range(n):
@@ -120,7 +120,7 @@ def overlaps(depth: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarra
 def prepare(
     folder: Path, points: Path, every: int, long_edge: int, drift: float
 ) -> tuple[KeyframeSet, ClassicalFlow, Truth]:
-    """Keyframes as a drifting tracker would have left them, and the truth about them."""
+    """Keyframes like a drifting tracker's, and the truth about them."""
     sequence = load(folder, InputConfig(long_edge=long_edge, stride=every))
     grid = SampleGrid(sequence.camera)
     depth = depths(read_surface(points).vertices, sequence.T_wc, grid)
@@ -146,7 +146,7 @@ def prepare(
 
 
 class Checks:
-    """The checks of candidate loops one by one: what each accepts, and whether that is right."""
+    """The checks of candidate loops one by one: pairs that each accepts, and their correctness."""
 
     def __init__(self, store: KeyframeSet, operator: ClassicalFlow, truth: Truth) -> None:
         self.store, self.operator, self.truth = store, operator, truth
@@ -156,12 +156,12 @@ class Checks:
         self.right: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.flow: list[tuple[float, ...]] = []
-        """Whether right, matched, residual and contradiction of each pair that flow has seen."""
+        """Correctness, matched fraction, residual and contradiction of each pair with flow."""
         self.scale_errors: list[float] = []
         self._verifier = TwoViewVerifier(store.grid.camera)
 
     def closed(self, i: int, k: int) -> set[str]:
-        """Check a pair; the checks that rightly accept it."""
+        """Check a pair; return the checks that rightly accept it."""
         store, truth = self.store, self.truth
         found = set[str]()
 
@@ -200,7 +200,7 @@ class Checks:
 
 
 def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
-    """Retrieval, then verification of all that it returned, with and without depth."""
+    """Test the retrieval, then the verification of all its results, with and without depth."""
     checks, index = Checks(store, operator, truth), AppearanceIndex()
     clock, features = checks.clock, checks.features
     precision, recall, first = [], [], []
@@ -252,7 +252,7 @@ def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int
 
 
 def together(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
-    """The detector as a system would run it."""
+    """Test the detector as the system runs it."""
     detector, clock = (
         LoopDetector(store.table, operator, LoopConfig(min_gap=gap)),
         Clock(),

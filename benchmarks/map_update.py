@@ -1,25 +1,25 @@
-"""Move a real map by a real loop closure in every way there is, and measure what becomes of it.
+"""Correct a map after a loop closure by every update rule, and measure the results.
 
     python benchmarks/map_update.py [--drift 0.05 0.1] [--scene across outward] [--mesh]
 
-A synthetic room is walked once around and a little more, so that the end sees the start: looking
+A path leads once around a synthetic room and a little more, so that the end sees the start: looking
 *across* the room, where most is seen again and again, or *outward*, where nothing is until the end.
-Keyframes have noisy depths and poses that drift as a monocular tracker's do: lengths grow by the
-drift over the lap, directions turn by a tenth of a degree for every per cent of it, and every step
-adds 0.5 mm and 0.01 degrees of its own. The map is built from them online. Loops between the two
+Keyframes have noisy depths and poses that drift like a monocular tracker's: lengths grow by the
+drift over the lap, directions rotate by a tenth of a degree for every per cent of it, and every
+step adds noise of 0.5 mm and 0.01 degrees. The map is built from them online. Loops between the two
 visits of the start are closed by the pose graph, and each update moves a copy of the map. Ground
-truth only measures; *true drift* moves every disk by the true error of the keyframe that made it,
-and *blended by true drift* blends these. Columns:
+truth is only used to measure; *true drift* moves every disk by the true error of the keyframe that
+made it, and *blended by true drift* blends these. Columns:
 
 - Acc: mean distance of the disks (opacity at least a half) to the true surface after the similarity
-  that lays the corrected keyframes' positions on the true ones; cm.
+  that aligns the corrected keyframes' positions with the true ones; cm.
 - torn: |log(distance after / distance before)| between disks and their six nearest of other
   keyframes within eight keyframes, on one surface before, less the smooth stretch there (the linear
-  map that fits best what the 32 nearest disks did); median and 95th percentile, per cent.
-- double: share of disks that have, within 3 cm along the surface, one of another visit (20
-  keyframes or more) that lies 1.5 to 6 cm above or below and looks the same way; per cent.
+  map that best fits the motion of the 32 nearest disks); median and 95th percentile, per cent.
+- double: fraction of disks that have, within 3 cm along the surface, one of another visit (20
+  keyframes or more) 1.5 to 6 cm above or below with a similar normal; per cent.
 - mesh Acc and Comp: of the fused renderings from all keyframes; cm.
-- ms: what planning the update takes.
+- ms: time to plan the update.
 """
 
 import argparse
@@ -74,7 +74,7 @@ MAPPING = replace(Config().mapping, render_long_edge=200)
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What a tracker knows of a keyframe."""
+    """A keyframe as a tracker estimates it."""
 
     image: np.ndarray
     T_cw: Tensor
@@ -84,13 +84,13 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """Keyframes of a room as a drifting tracker hands them over, and the truth."""
+    """Keyframes of a room like a drifting tracker's, and the truth."""
 
     keyframes: list[Observed]
     truth: Tensor
     """(n, 4, 4) world to camera."""
     unit: Tensor
-    """Drifted lengths per metre of each keyframe."""
+    """Drifted units per metre at each keyframe."""
     surface: Surface
     seen: Surface
     """Points that the keyframes saw."""
@@ -106,7 +106,7 @@ def path(scene: str, room) -> np.ndarray:
     T = HandheldPath(room).at_frames(np.arange(0, EVERY * KEYFRAMES, EVERY))
     if scene == "across":
         return T
-    # Outwards and ahead: what is seen now is not seen again before the lap is done.
+    # Outwards and ahead: no surface is seen again before the end of the lap.
     centre = T[:, :3, 3]
     ahead = np.roll(centre, -2, 0) - np.roll(centre, 2, 0)
     ahead[:2], ahead[-2:] = ahead[2], ahead[-3]
@@ -123,7 +123,7 @@ def path(scene: str, room) -> np.ndarray:
 
 
 def walk(scene: str, drift: float, seed: int) -> Walk:
-    """The room walked around, with a drift of lengths over the lap."""
+    """Walk around the room, with a drift of scale over the lap."""
     room = make_room(seed)
     caster = Raycaster(room, threads=1)
     poses = path(scene, room)
@@ -138,7 +138,7 @@ def walk(scene: str, drift: float, seed: int) -> Walk:
         view = caster.render(CAMERA, T_wc)
         seen.add(view.depth, T_wc)
         z = view.depth[4 : CAMERA.height - 3 : 8, 4 : CAMERA.width - 3 : 8].astype(np.float64)
-        # The noise of tests' keyframes: most cells good to 2 %, a fifth hardly known.
+        # The noise of the tests' keyframes: most cells good to 2 %, a fifth nearly unknown.
         deviation = np.where(random.random(z.shape) < 0.2, 0.4, 0.02)
         noisy = float(unit[n]) * z * np.exp(deviation * random.standard_normal(z.shape))
         inverse, information = 1 / noisy, (noisy / deviation) ** 2
@@ -157,7 +157,7 @@ def walk(scene: str, drift: float, seed: int) -> Walk:
 
 
 def drifted(truth: Tensor, unit: Tensor, drift: float, seed: int) -> Tensor:
-    """The true steps, each in the unit of its time, turned a little, one upon the other."""
+    """Chain the true steps, each in its drifted unit and rotated a little."""
     g = torch.Generator().manual_seed(seed)
     noise = STEP_NOISE * torch.randn(len(truth), 6, generator=g, dtype=torch.float64)
     axis = torch.tensor([0.4, 0.8, -0.45], dtype=torch.float64)
@@ -171,7 +171,7 @@ def drifted(truth: Tensor, unit: Tensor, drift: float, seed: int) -> Tensor:
 
 
 def close(walk: Walk) -> PoseCorrection:
-    """The closure of the lap."""
+    """Close the loop of the lap by the pose graph."""
     T = walk.T_cw
     n = torch.arange(KEYFRAMES - 1)
     i, j = torch.cat([n, n[:-1]]), torch.cat([n + 1, n[:-1] + 2])
@@ -196,7 +196,7 @@ def close(walk: Walk) -> PoseCorrection:
 
 
 def build(keyframes: Sequence[Observed], config: MappingConfig) -> Mapper:
-    """The map as an online run makes it."""
+    """Build the map like an online run."""
     segment = KeyframeTable.on(SampleGrid(CAMERA)).new_set()
     mapper = Mapper(segment.table, config)
     for n, seen in enumerate(keyframes):
@@ -232,7 +232,7 @@ class Judge:
         return 100 * float(left.square().sum(1).mean().sqrt())
 
     def row(self, name: str, mapper: Mapper, T_cw: Tensor, seconds: float) -> str:
-        """A line of the table."""
+        """Format a line of the table."""
         s, R, t = self.alignment(T_cw)
         solid = mapper.table.disks.opacity >= 0.5
         x = mapper.table.disks.position.detach().double()
@@ -245,7 +245,7 @@ class Judge:
         return "| " + " | ".join(cells) + " |"
 
     def tearing(self, mapper: Mapper) -> tuple[str, str]:
-        """Median and 95th percentile; nothing once disks were dropped."""
+        """Median and 95th percentile; empty if disks were dropped."""
         if len(mapper.table.disks) != len(self.position):
             return "", ""
         i, j = self.pairs
@@ -256,11 +256,11 @@ class Judge:
         return f"{100 * torn.median():.2f}", f"{100 * torn.quantile(0.95):.2f}"
 
     def stretch(self, x: Tensor) -> Tensor:
-        """The linear map around each disk that fits what its surroundings did best."""
+        """The linear map around each disk that best fits the motion of its neighbours."""
         before, after = (p[self.around] - p[:, None] for p in (self.position, x))
         square = before.mT @ before
         ridge = 1e-3 * square.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * torch.eye(3)
-        # What is hardly seen, off the surface, follows the mean growth.
+        # The nearly undetermined direction off the surface gets the mean growth.
         growth = (after.square().sum((1, 2)) / before.square().sum((1, 2))).sqrt()
         right = before.mT @ (after - growth[:, None, None] * before)
         return torch.linalg.solve(square + ridge, right).mT + growth[:, None, None] * torch.eye(3)
@@ -297,7 +297,7 @@ def neighbouring(mapper: Mapper, reach: int = 8) -> tuple[Tensor, Tensor]:
 
 
 def double(mapper: Mapper, metre: float, apart: int = 20) -> float:
-    """Per cent of the disks that lie over or under the surface of another visit."""
+    """Per cent of the disks above or below the surface of another visit."""
     solid = mapper.table.disks.opacity >= 0.5
     x = metre * mapper.table.disks.position.detach().double()[solid]
     n, anchor = normals(mapper)[solid], mapper.table.disks.keyframe_id[solid]
@@ -312,7 +312,7 @@ def double(mapper: Mapper, metre: float, apart: int = 20) -> float:
 
 
 def true_drift(walk: Walk) -> PoseCorrection:
-    """What the keyframes really erred by."""
+    """Correction by the true errors of the keyframes."""
     ids = range(len(walk.keyframes))
     return PoseCorrection(
         dict(zip(ids, walk.T_cw, strict=True)),
@@ -356,7 +356,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
 
 
 def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
-    """Seconds of planning alone, the better of two."""
+    """Seconds of planning alone, the least of two."""
 
     def plan() -> torch.Tensor:
         seen = [covisible_keyframe(v, correction) for v in mapper.views.values() if v.has_depth]

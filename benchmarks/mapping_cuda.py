@@ -1,4 +1,4 @@
-"""Speed of one mapping iteration on a GPU: the CUDA graph of a run beside plain PyTorch losses.
+"""Speed of one mapping iteration on a GPU: the CUDA graph of a run against plain PyTorch losses.
 
     python benchmarks/mapping_cuda.py [--rounds 30] [--steps 40] [--json FILE]
 
@@ -51,9 +51,9 @@ from oracles.single_view_reference import single_view_loss
 FRAMES_APART = 6
 """Frames between two views on the path."""
 NOISE = 0.005
-"""Deviation of the disks' depths, relative."""
+"""Relative standard deviation of the disks' depths."""
 SCALE, OPACITY = 1.0, 0.9
-"""Deviation of a disk over the distance to the next ones; these cover a view as training does."""
+"""Standard deviation of a disk over the distance to the next ones, and opacity: as in training."""
 CONFIGS = {
     "of a run": LossConfig(),
     "all of the paper": LossConfig(
@@ -68,12 +68,12 @@ PARTS = {
     "rendering, backward": ("unblend_tiles", "project_backward", "sum_poses"),
     "Adam": ("adam_step", "begin_step"),
 }
-"""Kernels by name; what is neither here nor a copy belongs to the losses."""
+"""Kernels by name; all others, except copies, belong to the losses."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """Views with true depths as priors, and disks about the surfaces that they see."""
+    """Views with true depths as priors, and disks near the surfaces that they see."""
 
     cameras: MapCameras
     batch: Batch
@@ -103,7 +103,7 @@ class Window:
         unit = float(torch.stack(depths).median())
         made = _disks(own, depths, cameras, disks)
         bounds = MappingConfig().disk.min_scale * unit, MappingConfig().disk.max_scale * unit
-        made.log_scale.clamp_(*np.log(bounds))  # as every step does
+        made.log_scale.clamp_(*np.log(bounds))  # as in every step
         return Window(cameras, batch, DiskParameters(*(p.to(device) for p in made)), unit)
 
 
@@ -126,7 +126,7 @@ def _view(
 def _disks(
     views: list[MapView], depths: list[Tensor], cameras: MapCameras, count: int
 ) -> DiskParameters:
-    """Exactly ``count`` disks at evenly drawn pixels of all views, about as a run makes them."""
+    """Make exactly ``count`` disks at evenly drawn pixels of all views, about like a run."""
     random, camera = torch.Generator().manual_seed(0), cameras.render
     area = camera.width * camera.height
     points, spans = [], []
@@ -168,7 +168,7 @@ class Fused:
 
 
 class Plain:
-    """The same renderer with PyTorch's operations for all the rest."""
+    """The same renderer with PyTorch's operations for the rest."""
 
     def __init__(self, window: Window, config: LossConfig) -> None:
         device = window.disks.position.device
@@ -224,7 +224,7 @@ Contestant = TypeVar("Contestant", Fused, Plain)
 def agreement(fused: Fused, plain: Plain) -> tuple[float, float]:
     """Relative difference of the losses and cosine of the gradients.
 
-    Of a second step, in which the renderings of the first one tell what is hidden.
+    Both are of a second step, which tests occlusion by the renderings of the first one.
     """
     for contestant in (fused, plain):
         contestant.train(2)
@@ -251,7 +251,7 @@ def time_in_turns(fused: Fused, plain: Plain, steps: int, rounds: int) -> tuple[
 
 
 def parts_of(kernels: dict[str, float]) -> dict[str, float]:
-    """The kernels' times by what they are for."""
+    """The kernels' times by their part of the step."""
     parts = dict.fromkeys(("rendering", "losses", "rendering, backward", "Adam", "copies"), 0.0)
     for name, time in kernels.items():
         part = next((p for p, names in PARTS.items() if name.startswith(names)), "losses")
@@ -264,7 +264,7 @@ def parts_of(kernels: dict[str, float]) -> dict[str, float]:
 
 
 def started(make: Callable[[], Contestant]) -> tuple[Contestant, float]:
-    """A contestant after two steps and the most memory of its tensors meanwhile, in MiB."""
+    """A contestant after two steps, and the peak memory of its tensors in MiB."""
     passes._pool.cache_clear()  # no buffers of earlier renderings
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
@@ -296,7 +296,7 @@ def measure(name: str, window: Window, steps: int, rounds: int) -> dict:
 
 
 def report(rows: list[dict]) -> str:
-    """Markdown tables; milliseconds of a step."""
+    """Markdown tables of milliseconds of a step."""
     lines = [
         "| losses | fused | its kernels | plain | its kernels | plain / fused | fused (MiB) |"
         " plain (MiB) | loss differs by | cosine of gradients | |",
@@ -335,7 +335,7 @@ def main() -> None:
     args = parser.parse_args()
     if not torch.cuda.is_available():
         raise SystemExit("This benchmark needs a GPU.")
-    # The profiler sees the kernels of graphs that were captured after its first start.
+    # The profiler only records the kernels of graphs captured after its first start.
     kernel_milliseconds(torch.cuda.synchronize, 1)
     window = Window.make(args.views, args.disks, args.width, args.height, torch.device("cuda"))
     rows = [measure(name, window, args.steps, args.rounds) for name in CONFIGS]

@@ -1,12 +1,11 @@
-"""Relations that the whole must keep, whatever the truth: what is the same world is the same map.
+"""Metamorphic relations of the whole system: the same world must give the same map.
 
     python benchmarks/metamorphic.py SEQUENCE [--frames 60] [--long-edge 160] [--preset fast]
 
-The sequence is reconstructed as it is and as other cameras would have brought it: mirrored, at half
-the frame rate, with intrinsics for images of another size, darker with another gamma, backwards.
-Printed is how far path and disks are from those of the sequence as it is, after the best
-similarity, of the extent of each; beside them what is allowed. Ends with 1 where a
-relation does not hold.
+The sequence is reconstructed unchanged and as from other cameras: mirrored, at half the frame rate,
+with intrinsics for images of another size, darker with another gamma, backwards. Printed are the
+distances of path and disks from those of the unchanged sequence, after the best similarity, as
+fractions of their extents, with the allowed ones. Ends with 1 if a relation does not hold.
 """
 
 import argparse
@@ -31,41 +30,41 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class Shape:
-    """What came of a sequence, in a world of its own."""
+    """Reconstruction of a sequence, in its own world."""
 
     poses: dict[int, np.ndarray]
-    """Camera to world, by the frame of the sequence as it is, where it was tracked."""
+    """Camera to world of the tracked frames, by their index in the unchanged sequence."""
     disks: np.ndarray
     """Centres (n, 3)."""
 
     def mirrored(self) -> "Shape":
-        """Left and right exchanged."""
+        """Exchange left and right."""
         poses = {k: MIRROR @ T @ MIRROR for k, T in self.poses.items()}
         return Shape(poses, self.disks @ MIRROR[:3, :3])
 
 
 @dataclass(frozen=True)
 class Relation:
-    """Another way to bring the same world."""
+    """Another input of the same world."""
 
     name: str
     change: Callable[[Sequence[Frame], Camera], tuple[list[Frame], Camera]]
-    """Frames, whose index stays that of the sequence as it is, and their camera."""
+    """Makes the frames, which keep the index of the unchanged sequence, and their camera."""
     path: float
-    """Distance of the places that is allowed, RMS, of the extent of the path."""
+    """Largest RMS distance of the positions, as a fraction of the path's extent."""
     map: float
-    """Distance of the disks that is allowed, median, of the extent of the map."""
+    """Largest median distance of the disks, as a fraction of the map's extent."""
     is_mirrored: bool = False
 
 
 def mirrored(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Camera]:
-    """Left and right exchanged."""
+    """Exchange left and right."""
     flipped = [replace(f, image=np.ascontiguousarray(f.image[:, ::-1])) for f in frames]
     return flipped, replace(camera, cx=camera.width - 1 - camera.cx)
 
 
 def half_the_rate(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Camera]:
-    """Every other frame."""
+    """Keep every other frame."""
     return list(frames[::2]), camera
 
 
@@ -75,20 +74,20 @@ def slower(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Camera
 
 
 def other_unit(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Camera]:
-    """Intrinsics that were found on images of three times the size."""
+    """Give intrinsics for images of three times the size."""
     large = camera.resized(3 * camera.width, 3 * camera.height)
     known = Calibration(large.fx, large.fy, large.cx, large.cy, (), large.width, large.height)
     return list(frames), known.fit(camera.width, camera.height).camera()
 
 
 def darker(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Camera]:
-    """Another exposure and another gamma."""
+    """Change exposure and gamma."""
     table = (255 * 0.85 * (np.arange(256) / 255) ** 1.15).round().astype(np.uint8)
     return [replace(f, image=table[f.image]) for f in frames], camera
 
 
 def backwards(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Camera]:
-    """The last frame first."""
+    """Reverse the frames."""
     end = frames[-1].timestamp
     return [replace(f, timestamp=end - f.timestamp) for f in reversed(frames)], camera
 
@@ -104,7 +103,7 @@ RELATIONS = (
 
 
 def shape_of(frames: Sequence[Frame], camera: Camera, config: Config) -> Shape:
-    """Run everything on frames, whose index is only remembered."""
+    """Run the system on frames; their own indices are only used for the result."""
     slam = Slam(camera, config, device="cpu")
     for index, frame in enumerate(frames):
         slam.process(replace(frame, index=index))
@@ -116,15 +115,15 @@ def shape_of(frames: Sequence[Frame], camera: Camera, config: Config) -> Shape:
 
 
 def distances(shape: Shape, as_it_is: Shape) -> tuple[float, float]:
-    """Distances of path (RMS) and disks (median) after a similarity, as parts of their extents.
+    """Distances of path (RMS) and disks (median) after a similarity, as fractions of their extents.
 
-    Disks are measured to the nearest of the other map; infinite where there is too little.
+    Disks are measured to the nearest of the other map; infinite if there are too few.
     """
     both = sorted(shape.poses.keys() & as_it_is.poses.keys())
     if len(both) < max(3, len(shape.poses) // 2) or not len(shape.disks):
         return float("inf"), float("inf")
     here, there = (np.array([some.poses[k] for k in both]) for some in (shape, as_it_is))
-    # The path may be nearly straight, so the cameras' own axes tell the rotation.
+    # The path may be nearly straight, so the cameras' axes determine the rotation.
     u, _, vt = np.linalg.svd((there[:, :3, :3] @ here[:, :3, :3].transpose(0, 2, 1)).sum(0))
     R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     centre, target = here[:, :3, 3].mean(0), there[:, :3, 3].mean(0)
@@ -148,7 +147,7 @@ def held(
 
 
 def main() -> None:
-    """All relations on a sequence."""
+    """Test all relations on a sequence."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--frames", type=int, default=60)

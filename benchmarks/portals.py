@@ -1,4 +1,4 @@
-"""Renders a suite of rooms: the room around the camera, and others through its doors."""
+"""Rendering of a suite of rooms: the room around the camera, and others through its doors."""
 
 from collections import OrderedDict
 from dataclasses import replace
@@ -12,7 +12,7 @@ from suite import Suite
 
 _ROOMS_IN_MEMORY = 6
 _DEPTH = 2
-"""Doors in a row that one sees through."""
+"""Largest number of consecutive doors to see through."""
 
 
 class SuiteRaycaster:
@@ -26,8 +26,8 @@ class SuiteRaycaster:
     def render(
         self, camera: Camera, T_wc: Float64[np.ndarray, "4 4"]
     ) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-        """RGB and z in metres (0 where all rooms looked into are open) of the rays through the
-        pixel centres."""
+        """RGB and z in metres of the rays through the pixel centres; z is 0 for rays that leave
+        through the last open door."""
         own = self.suite.nearest(T_wc[:3, 3])
         view = self._room(own, camera, T_wc)
         image, depth = view.image, view.depth
@@ -59,9 +59,9 @@ class SuiteRaycaster:
 
 
 def _around(hole: np.ndarray, camera: Camera) -> tuple[int, int, Camera]:
-    """Top and left of the smallest window around the true pixels, and the camera that sees it."""
+    """Top and left of the smallest window around the true pixels, and its camera."""
     rows, columns = np.flatnonzero(hole.any(1)), np.flatnonzero(hole.any(0))
-    # The kernels tell the size of a pixel from two of them.
+    # The kernels compute the size of a pixel from two of them.
     top, left = min(rows[0], camera.height - 2), min(columns[0], camera.width - 2)
     height, width = max(rows[-1] + 1 - top, 2), max(columns[-1] + 1 - left, 2)
     part = replace(

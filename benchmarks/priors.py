@@ -1,13 +1,13 @@
-"""What a monocular prior brings to tracking and to the map, and what a bad one costs.
+"""Gain from a monocular prior in tracking and in the map, and loss from a bad one.
 
     python benchmarks/priors.py [--frames 80] [--long-edge 320] [--rooms 2] [--kind scale_free]
     python benchmarks/priors.py --map [--frames 60] [--rooms 1]
 
-Rooms whose walls are painted in one colour are tracked without a prior, with one that errs as
-networks do, and with one that is wrong by a factor of two and more in a third of each image (see
+Rooms with walls of one colour are tracked without a prior, with one that has errors like a
+network's, and with one that is wrong by a factor of two and more in a third of each image (see
 ``degraded_prior.py``). Depth errors are relative, over the tracker's grid of all keyframes but the
 first and last, after the similarity that aligns the trajectory. With ``--map`` the whole system
-runs, and the errors are those of the depth and normals of the map seen from all keyframes.
+runs, and the errors are those of the depth and normals of the map rendered from all keyframes.
 """
 
 import argparse
@@ -49,15 +49,15 @@ class Walk:
 
 @dataclass(frozen=True)
 class Score:
-    """How far poses and depths are from the truth."""
+    """Errors of poses and depths."""
 
     ate_cm: float
-    """Root mean square over the keyframes."""
+    """RMSE of the keyframes' positions."""
     median: float
-    """Relative depth error."""
+    """Median relative depth error."""
     mean: float
     bare_median: float
-    """Where the image has no texture."""
+    """The same where the image has no texture."""
     bare_mean: float
     textured_mean: float
     bare_share: float
@@ -73,7 +73,7 @@ def walk(seed: int, frames: int, long_edge: int, bare: bool = True) -> Walk:
 
 
 def track(walk: Walk, prior: MonocularPrior | None, config: PriorConfig) -> Tracker:
-    """A tracker that has seen all of it."""
+    """Run a tracker on a whole walk."""
     tracker = lone_tracker(walk.camera, Config(prior=config or PriorConfig()), prior=prior)
     for n, view in enumerate(walk.views):
         tracker.track(Frame(n, n / 30, view.image))
@@ -102,15 +102,15 @@ def score(tracker: Tracker, walk: Walk) -> Score:
 
 @dataclass(frozen=True)
 class MapScore:
-    """How far the map seen from the keyframes is from the truth."""
+    """Errors of the map rendered from the keyframes."""
 
     mean: float
-    """Relative depth error."""
+    """Mean relative depth error."""
     bare_mean: float
     bare_wrong: float
-    """Part of the pixels without texture that is off by more than 5 %."""
+    """Fraction of the pixels without texture with errors above 5 %."""
     normal: float
-    """Mean angle in degrees."""
+    """Mean angle between normals, degrees."""
     bare_normal: float
     disks: int
 
@@ -146,7 +146,7 @@ def map_score(slam: Slam, walk: Walk) -> MapScore:
 
 
 def compare_maps(walk: Walk, kind: DepthKind, config: PriorConfig) -> None:
-    """A table of maps, with and without the normals of the prior."""
+    """Print a table of maps, with and without the normals of the prior."""
     print_row("prior", "its normals", "depth", "bare", "bare > 5 %", "angle", "bare", "disks", "s")
     print("|---" * 9 + "|")
     cases = (
@@ -174,7 +174,7 @@ def compare_maps(walk: Walk, kind: DepthKind, config: PriorConfig) -> None:
 
 
 def print_row(*cells: object) -> None:
-    """One line of a table."""
+    """Print one line of a table."""
     print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
 
@@ -190,7 +190,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=[k.value for k in DepthKind], default="scale_free")
     parser.add_argument("--set", nargs="*", default=[], help="name=value of PriorConfig")
     args = parser.parse_args()
-    torch.set_num_threads(1)  # as the system works; our own threads use the cores
+    torch.set_num_threads(1)  # as in the system; our own threads use the cores
     changes = {k: json.loads(v) for k, v in (item.split("=") for item in args.set)}
     config = dataclasses.replace(PriorConfig(), **changes)
     for seed in range(args.rooms if args.map else 0):

@@ -44,7 +44,7 @@ def milliseconds(function: Callable[[], object]) -> float:
 
 
 def reference_milliseconds(disks: DiskParameters, pose: torch.Tensor, camera: Camera) -> float:
-    """Forward and backward of the specification, from a strip across the image's middle."""
+    """Time of the specification, forward and backward, from a strip across the image's middle."""
     top = camera.height // 2
     strip = Camera(camera.fx, camera.fy, camera.cx, camera.cy - top, camera.width, REFERENCE_ROWS)
     leaves = DiskParameters(*(p.clone().requires_grad_() for p in disks))

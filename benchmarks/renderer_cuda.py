@@ -1,10 +1,10 @@
-"""Speed of the CUDA renderer beside gsplat's 2-D renderer, forward and backward.
+"""Speed of the CUDA renderer against gsplat's 2-D renderer, forward and backward.
 
     python benchmarks/renderer_cuda.py [--rounds 30] [--json FILE]
 
 Needs a GPU. Ours is measured twice: differentiated by autograd, and by the pull-back of
-``render_vjp``. Where gsplat (1.5) can be imported, all render the same room in turns, so that what
-else the machine does hits them alike. Its times are for its public autograd function as it stands,
+``render_vjp``. If gsplat (1.5) can be imported, all render the same room in turns, so that other
+load of the machine affects them alike. Its times are for its public autograd function, unchanged,
 which blends the depths of the disks' centres, not of the hits, and waits for the GPU at the end of
 its backward pass (the sums over the kernels leave that out). Each time is the median over the
 rounds of one forward and backward pass: between CUDA events around a burst of passes, the same with
@@ -41,14 +41,14 @@ FURNITURE = [
 ]
 """Centre and size of boxes, metres."""
 OVERLAP = 0.75
-"""Deviation of a disk over the mean distance to the next."""
+"""Standard deviation of a disk over the mean distance to the next."""
 BURST = 20
-"""Passes in a turn, so that the host may run ahead as it does in training."""
+"""Passes in a turn, so that the host may run ahead as in training."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is rendered."""
+    """Input of the renderers."""
 
     disks: DiskParameters
     camera: Camera
@@ -82,7 +82,7 @@ def room_faces() -> np.ndarray:
 
 
 def room_camera(width: int, height: int) -> tuple[Camera, Tensor]:
-    """In one corner of the room, looking at the boxes; and its pose, float64."""
+    """A camera in one corner of the room that looks at the boxes, and its pose, float64."""
     focal = float(width / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2))
     eye, target = np.array([0.5, 0.7, 1.6]), np.array([3.6, 2.4, 0.9])
     forward = (target - eye) / np.linalg.norm(target - eye)
@@ -95,7 +95,7 @@ def room_camera(width: int, height: int) -> tuple[Camera, Tensor]:
 
 
 def room_case(count: int, width: int, height: int, device: str = "cuda", seed: int = 0) -> Case:
-    """Disks spread evenly over those surfaces that lie in the view, about as a trained map has."""
+    """Make disks spread evenly over the surfaces in the view, about like a trained map's."""
     random = np.random.default_rng(seed)
     camera, T_cw = room_camera(width, height)
     faces = room_faces()
@@ -176,7 +176,7 @@ class OursByPullBack(Ours):
 
 
 class Gsplat:
-    """gsplat's 2-D renderer on the same disks; raises ImportError where it is not installed."""
+    """gsplat's 2-D renderer on the same disks; raises ImportError if it is not installed."""
 
     name = "gsplat"
 
@@ -251,7 +251,7 @@ def contestants(count: int, width: int, height: int) -> list[Ours | Gsplat]:
 
 
 def measure(cases: list[tuple[int, int, int]], rounds: int) -> list[dict]:
-    """A row per case: times of the renderers and how far they agree."""
+    """Measure a row per case: times of the renderers and their differences."""
     fields = [contestants(*case) for case in cases]
     times, alone = [], []
     for renderers in fields:
@@ -259,7 +259,7 @@ def measure(cases: list[tuple[int, int, int]], rounds: int) -> list[dict]:
         times.append(time_in_turns(steps, rounds))
         with torch.autograd.set_multithreading_enabled(False):
             alone.append(time_in_turns(steps, rounds))
-    rows = []  # the profiler comes last, because it leaves later launches slower
+    rows = []  # the profiler comes last, because it makes later launches slower
     for case, renderers, timed, single in zip(cases, fields, times, alone, strict=True):
         row: dict = dict(zip(("disks", "width", "height"), case, strict=True)) | {"times": {}}
         for renderer, (device, host), (one, _) in zip(renderers, timed, single, strict=True):
@@ -272,14 +272,15 @@ def measure(cases: list[tuple[int, int, int]], rounds: int) -> list[dict]:
 
 
 def compare(ours: Ours | Gsplat, theirs: Gsplat) -> dict:
-    """Mean differences of the maps, and how much there was to do."""
+    """Mean differences of the maps, and the number of disk-tile pairs."""
     pairs = zip(ours.alpha_and_normal(), theirs.alpha_and_normal(), strict=True)
     alpha, normal = (float((a - b).abs().mean()) for a, b in pairs)
     return {"alpha_difference": alpha, "normal_difference": normal, "pairs": theirs.pairs()}
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown; milliseconds. gsplat's time over a renderer's is above 1 where that is faster."""
+    """Markdown table of milliseconds; gsplat's time over a renderer's is above 1 if that is
+    faster."""
     kinds = ("device", "one_thread", "kernels")
     lines = [
         "| disks | image | renderer | ms | one thread | kernels | host |"

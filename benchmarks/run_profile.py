@@ -1,15 +1,15 @@
-"""Where a second of ``geogs run`` goes, from the command to its exit.
+"""Profile of ``geogs run``, from the command to its exit.
 
     python benchmarks/run_profile.py SOURCE [--device cpu] [--functions 10] [--config.key VALUE ...]
 
-Start-up is measured in processes of their own: the help, PyTorch's import, all imports of a run.
-The whole command is another one, with the files it writes into a folder that is deleted again.
-Then the same run is made here, and of every stage two times are printed: by the clock on the wall,
-and of all threads of the process on the CPU, which tells on a machine that others use, too. A stage
-within another counts for itself alone. With ``--functions N`` a second run follows under Python's
-profiler, and the N costliest functions of each stage are printed; compiled loops and PyTorch's
-operators appear under the function that calls them or their own names. Python 3.11 alone can do
-that: later ones count in one profile what all threads do.
+Start-up is measured in separate processes: the help, PyTorch's import, all imports of a run. The
+whole command is another one, with its files in a folder that is deleted again. Then the same run is
+made in this process, and two times of every stage are printed: wall-clock time, and CPU time of all
+threads of the process, which is also valid on a shared machine. The time of a nested stage is not
+counted in the outer one. With ``--functions N`` a second run follows under Python's profiler, and
+the N costliest functions of each stage are printed; compiled loops and PyTorch's operators appear
+under the function that calls them or their own names. Only Python 3.11 can do that: later ones
+count all threads in one profile.
 """
 
 import argparse
@@ -44,15 +44,15 @@ STARTS = {
         "import geogs.application.run, geogs.application.progress.terminal_progress"
     ),
 }
-"""What a process of its own does before it ends."""
+"""Code of the separate processes whose start-up is measured."""
 LEAST_SHARE = 0.01
-"""Part of a stage's time below which a function is not printed."""
+"""Fraction of a stage's time below which a function is not printed."""
 
 
 class StageMeter(Stopwatch):
-    """A stopwatch that counts the seconds of the CPU as well, and can profile each stage.
+    """A stopwatch that also counts CPU seconds, and can profile each stage.
 
-    Unlike in a run, a stage within another is taken out of that.
+    Unlike in a run, the time of a nested stage is not counted in the outer one.
     """
 
     def __init__(self, profiles: bool) -> None:
@@ -79,7 +79,7 @@ class StageMeter(Stopwatch):
             self._follow(True)
 
     def _settle(self) -> None:
-        """Give the stage at hand the seconds since it began or went on."""
+        """Add the seconds since the current stage began or resumed to it."""
         now = (time.perf_counter(), time.process_time())
         if self._stages:
             stage, (wall, processor) = self._stages[-1], self._since
@@ -88,7 +88,7 @@ class StageMeter(Stopwatch):
             self._follow(False)
 
     def _follow(self, begins: bool) -> None:
-        """The stage at hand goes on, or gives way to another."""
+        """Resume or suspend the current stage."""
         self._since = (time.perf_counter(), time.process_time())
         if self._with_profiles and self._stages:
             stage = self._stages[-1]
@@ -97,7 +97,7 @@ class StageMeter(Stopwatch):
 
 
 def start_up(code: str) -> tuple[float, float]:
-    """Seconds of the wall and of the CPU that a new interpreter needs for some code."""
+    """Wall-clock and CPU seconds of a new interpreter for some code."""
     measure = (
         f"import sys, time; out, sys.stdout = sys.stdout, sys.stderr\n{code}\n"
         "print(time.process_time(), file=out)"
@@ -110,10 +110,10 @@ def start_up(code: str) -> tuple[float, float]:
 
 
 def whole_command(source: Path, device: str, options: list[str]) -> tuple[float, float]:
-    """Seconds of the wall and of the CPU of ``geogs run`` in a process of its own.
+    """Wall-clock and CPU seconds of ``geogs run`` in its own process.
 
     Raises:
-        CalledProcessError: it failed; what it said has been printed.
+        CalledProcessError: it failed; its output has been printed.
     """
     before, start = os.times(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -128,7 +128,7 @@ def whole_command(source: Path, device: str, options: list[str]) -> tuple[float,
 def measured_run(
     source: Path, config: Config, device: str, profiles: bool
 ) -> tuple[StageMeter, float, int]:
-    """A run from opening to report; its meter, CPU seconds to the first tracked frame, frames."""
+    """Run to the report; return the meter, CPU seconds to the first tracked frame, and frames."""
     meter, start, first = StageMeter(profiles), time.process_time(), float("nan")
     with meter("opening"):
         compile_gpu_kernels(torch.device(device))
@@ -136,7 +136,7 @@ def measured_run(
     with meter("calibration"):
         stream = self_calibrated(stream, config, device)
     with meter("making the system"):
-        at_end = config.mapping.when != "online"  # as a run from files has it
+        at_end = config.mapping.when != "online"  # as in a run from files
         slam = Slam(stream.camera, config, device, mask=stream.mask, defers_map=at_end)
     slam.stopwatch = slam.executor.stopwatch = meter
     frames = iter(stream)
@@ -155,7 +155,7 @@ def measured_run(
 
 
 def print_functions(meter: StageMeter, count: int, show: Callable[[str], None] = print) -> None:
-    """The costliest functions of each stage by their own seconds, compiled ones included."""
+    """Print the costliest functions of each stage by their own seconds, with compiled ones."""
     for stage, profile in meter.profiles.items():
         entries = pstats.Stats(profile).stats  # type: ignore[attr-defined]
         total = sum(entry[2] for entry in entries.values())
@@ -197,7 +197,7 @@ def main() -> None:
 
 
 def print_stages(meter: StageMeter, show: Callable[[str], None] = print) -> None:
-    """The seconds of each stage, the longest first."""
+    """Print the seconds of each stage, the longest first."""
     total, total_cpu = meter.total, sum(meter.processor.values())
     for stage, seconds in sorted(meter.seconds.items(), key=lambda item: -item[1]):
         processor = meter.processor[stage]

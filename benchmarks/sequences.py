@@ -1,4 +1,4 @@
-"""Sequences with true poses, for the benchmarks of parts of the system."""
+"""Sequences with true poses for the benchmarks of parts of the system."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +15,8 @@ from geogs.io.sources.sniff import open_source
 from geogs.types import Frame
 
 COLOUR = 0.025
-"""Metres to the right of the depth camera of 7-Scenes, whose poses are given, where the images are
-taken."""
+"""Offset of the colour camera of 7-Scenes to the right of the depth camera, whose poses are given,
+metres."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Sequence:
 
 
 def load(folder: Path, config: InputConfig) -> Sequence:
-    """A folder in the layout of Replica or of 7-Scenes; frames without a pose are left out."""
+    """Load a folder in the layout of Replica or 7-Scenes; frames without a pose are left out."""
     source, truth = open_source(folder, config), read_true_scene(folder).trajectory
     frames = list(source)
     i, j = associate(truth.timestamps, np.array([frame.timestamp for frame in frames]), 0.005)

@@ -1,16 +1,15 @@
-"""Endurance: random synthetic videos with random settings, killed and gone on with, for hours.
+"""Endurance test: random synthetic videos with random settings, killed and resumed, for hours.
 
     python benchmarks/soak.py [--minutes 180] [--workers 1] [--seed 0] [--size 160 120]
         [--frames 30 90] [--repeats 8] [--folder FOLDER] [--report FILE.json]
 
-Every round renders a video and runs it twice, in processes of their own: once undisturbed, and once
-killed now and then (SIGKILL, SIGTERM, Ctrl-C, in the middle of whatever it does), on another number
-of threads each time, and gone on with by ``--resume``. Both must leave the same poses, map and mesh
-to the last bit. Looked at are all exit codes, tracebacks, NaN in any file, summaries as
-docs/summary.schema.json says, files that are not finished. As many rounds as there are workers go
-on at a time; no GPU is used. Meanwhile ``leaks.py`` runs one video again and again in one process.
-The report says how often what happened, and all that is wrong; the command ends with 1 if anything
-is. Folders of rounds in which nothing was wrong are deleted.
+Every round renders a video and runs it twice, in separate processes: once undisturbed, and once
+killed now and then (SIGKILL, SIGTERM, Ctrl-C, at any moment), on another number of threads each
+time, and resumed by ``--resume``. Both must write the same poses, map and mesh to the last bit.
+Checked are exit codes, tracebacks, NaN in any file, summaries by docs/summary.schema.json,
+incomplete files. Each worker runs one round at a time; no GPU is used. Meanwhile ``leaks.py`` runs
+one video repeatedly in one process. The report has the numbers of all events and all faults; the
+command ends with 1 if there is a fault. Folders of rounds without faults are deleted.
 """
 
 import argparse
@@ -46,32 +45,32 @@ CHOICES: dict[str, tuple[str, ...]] = {
 SWITCHES = ("--online-results", "--depth-mesh", "--no-keyframe-images")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 MOST_KILLS = 4
-"""Kills of a run, at most."""
+"""Most kills of a run."""
 STARTED = 2.0
-"""Seconds after which Python has begun with the program, to which signals belong from then on."""
+"""Seconds after which Python has started the program, which then handles signals."""
 
 
 @dataclass
 class Report:
-    """What happened, over all rounds."""
+    """Events of all rounds."""
 
     seed: int
     workers: int
     rounds: int = 0
     cut_off: int = 0
-    """Rounds that were going on when the time was over."""
+    """Number of unfinished rounds when the time was over."""
     runs: int = 0
-    """Processes."""
+    """Number of processes."""
     kills: Counter[str] = field(default_factory=Counter)
     """Number by signal."""
     resumes: int = 0
     compared: int = 0
-    """Runs that were disturbed and ended like their undisturbed twin, or should have."""
+    """Number of disturbed runs that were compared with their undisturbed twin."""
     refusals: Counter[str] = field(default_factory=Counter)
-    """Sentences of undisturbed runs that ended with 2, such as of a camera that stands still."""
+    """Messages of undisturbed runs that ended with 2, such as for a camera that does not move."""
     faults: list[dict[str, str]] = field(default_factory=list)
     leaks: dict[str, object] = field(default_factory=dict)
-    """What leaks.py found."""
+    """Results of leaks.py."""
     seconds: float = 0.0
 
 
@@ -86,7 +85,7 @@ class Soak:
         self.report = Report(options.seed, options.workers)
 
     def work(self) -> None:
-        """Round after round."""
+        """Run round after round."""
         while time.monotonic() < self._end:
             with self._lock:
                 number, self._begun = self._begun, self._begun + 1
@@ -98,7 +97,7 @@ class Soak:
                     self.report.cut_off += 1
                 shutil.rmtree(folder, ignore_errors=True)
                 return
-            except Exception as error:  # a fault of the soak must not look like all being well
+            except Exception as error:  # a fault of the soak must not look like success
                 found = [f"the soak broke off: {error!r}"]
             with self._lock:
                 self.report.rounds += 1
@@ -108,7 +107,7 @@ class Soak:
                 shutil.rmtree(folder, ignore_errors=True)
 
     def _round(self, folder: Path, dice: random.Random) -> list[str]:
-        """Render, run undisturbed and disturbed, check; what is wrong."""
+        """Render, run undisturbed and disturbed, check; return the faults."""
         video, twin, out = (folder / name for name in ("video", "twin", "out"))
         folder.mkdir(parents=True)
         synth = self._ended([*GEOGS, *synth_words(video, self._options, dice)])
@@ -134,14 +133,14 @@ class Soak:
     def _disturbed(
         self, first: list[str], out: Path, seconds: float, dice: random.Random
     ) -> tuple[Ending, list[str]]:
-        """Run with interruptions until it has ended; how it ended at last, and what was wrong."""
+        """Run with interruptions until the end; return the last ending and the faults."""
         kills, wrong, command = dice.randint(1, MOST_KILLS), list[str](), first
         while True:
             number = dice.choice(SIGNALS) if kills else None
             kills -= number is not None
             after = max(dice.uniform(0.0, 1.0) * seconds, STARTED)
             ending = self._ended(command, number, after, dice.choice(("1", "2", "3")))
-            # Python itself ends by the signal that comes as it shuts down, or amid an exec.
+            # A signal during Python's shutdown, or during an exec, ends Python itself.
             wrong += ending.wrong((0, 2, 130, -number) if number else (0, 2))
             is_open = (out / "checkpoint" / "manifest.json").is_file()
             if wrong or ((number is None or not ending.was_hit) and not is_open):
@@ -168,7 +167,7 @@ class Soak:
 
 
 def main() -> None:
-    """Workers and leaks side by side, then the report."""
+    """Run workers and leaks concurrently, then write the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=180.0)
     parser.add_argument("--workers", type=int, default=1)
@@ -201,7 +200,7 @@ def main() -> None:
 
 
 def synth_words(video: Path, options: argparse.Namespace, dice: random.Random) -> list[str]:
-    """What to render."""
+    """Arguments of ``geogs synth`` for a random video."""
     width, height = options.size
     return [
         "synth", str(video), "--frames", str(dice.randint(*options.frames)), "--width", str(width),
@@ -211,7 +210,7 @@ def synth_words(video: Path, options: argparse.Namespace, dice: random.Random) -
 
 
 def settings(dice: random.Random) -> list[str]:
-    """Some options with some of their values."""
+    """Random options with random values."""
     names = dice.sample(sorted(CHOICES), dice.randint(0, len(CHOICES)))
     words = [word for name in names for word in (name, dice.choice(CHOICES[name]))]
     return words + dice.sample(SWITCHES, dice.randint(0, len(SWITCHES)))
@@ -220,7 +219,7 @@ def settings(dice: random.Random) -> list[str]:
 def leaks(
     folder: Path, options: argparse.Namespace, end: float
 ) -> tuple[dict[str, object], list[str]]:
-    """What leaks.py finds in the time that there is, and what is wrong with it."""
+    """Run leaks.py for the available time; return its results and the faults."""
     folder.mkdir(parents=True, exist_ok=True)
     video = folder / "video"
     dice = random.Random(f"{options.seed}-leaks")

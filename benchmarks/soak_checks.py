@@ -1,4 +1,4 @@
-"""What the soak looks for in a folder of results."""
+"""Checks of the soak on a folder of results."""
 
 import json
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ MAP, MESH = "map.safetensors", "mesh.ply"
 
 
 def wrong_in(out: Path) -> Iterator[str]:
-    """What is wrong with the files of a result."""
+    """Yield the faults of the files of a result."""
     for path in out.rglob("*"):
         if path.name.endswith((".part", ".lock")):
             yield f"{path.name} was left behind"
@@ -35,7 +35,7 @@ def wrong_in(out: Path) -> Iterator[str]:
     if summary["not_started"] is not None or not summary["disks"]:
         return
     try:
-        result = load_result(out)  # refuses a map that is not finite
+        result = load_result(out)  # fails for a map that is not finite
         mesh = result.mesh
     except GeogsError as error:
         yield str(error)
@@ -49,7 +49,7 @@ def wrong_in(out: Path) -> Iterator[str]:
 
 
 def differences(twin: Path, out: Path) -> Iterator[str]:
-    """What differs between the result of an undisturbed run and that of a disturbed one."""
+    """Yield the differences between the results of an undisturbed and a disturbed run."""
     for name in (*TABLES, MESH, "config.yaml", "intrinsics.json"):
         one, other = (folder / name for folder in (twin, out))
         if one.is_file() != other.is_file():

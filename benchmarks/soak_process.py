@@ -1,4 +1,4 @@
-"""A process of the soak: started, hit by a signal after a while, and how it ended."""
+"""A process of the soak: its start, a signal after a while, and its ending."""
 
 import os
 import signal
@@ -11,23 +11,23 @@ from dataclasses import dataclass
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 HANGS = 1800.0
-"""Seconds after which a process counts as one that hangs; a third of that after a signal."""
+"""Seconds after which a process counts as hanging; a third of that after a signal."""
 
 
 class TimeIsUp(Exception):
-    """The soak is over; the process was ended without looking how."""
+    """The soak is over; the process was killed without checks."""
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a process ended."""
+    """Ending of a process."""
 
     code: int
     said: str
-    """On its standard error."""
+    """Text on its standard error."""
     seconds: float
     was_hit: bool = False
-    """Whether it got the signal before it ended by itself."""
+    """Whether it received the signal before it ended by itself."""
     hangs: bool = False
 
     @property
@@ -37,7 +37,7 @@ class Ending:
         return lines[-1][:300]
 
     def wrong(self, codes: Sequence[int]) -> Iterator[str]:
-        """What should not be, given the exit codes that may."""
+        """Yield the faults of this ending, given the allowed exit codes."""
         if self.hangs:
             yield "it hangs"
         elif "Traceback" in self.said or self.code not in codes:
@@ -58,7 +58,7 @@ def ended(
         end: of the soak, a time of ``time.monotonic``.
         number: a signal to send, if any.
         after: seconds after which it is sent.
-        threads: how many the process may use.
+        threads: number of threads that the process may use.
 
     Raises:
         TimeIsUp: the soak ended first.

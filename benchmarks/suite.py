@@ -1,7 +1,7 @@
 """Many furnished rooms in a ring, with doors between neighbours, and a walk through all of them.
 
 Two rows of rooms lie back to back; the walk leads along one and back along the other. Every room
-is drawn from the seed and its place, so that one can be made without the others.
+is drawn from the seed and its index, so that one can be made without the others.
 """
 
 import math
@@ -21,12 +21,12 @@ from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures import patterns
 
 ROOM = np.array([5.0, 4.4, 2.6])
-"""Metres across, deep and high."""
+"""Width, depth and height of a room, metres."""
 WALL = 0.2
-"""Metres between rooms."""
+"""Thickness of the walls between rooms, metres."""
 DOOR_WIDTH, DOOR_HEIGHT = 1.1, 2.1
 STEP = 0.022
-"""Metres that the camera moves from one frame to the next."""
+"""Distance between the camera's positions in two frames, metres."""
 _ASIDE = 0.6
 _AHEAD = 1.5
 _SWAY, _SWAY_LENGTH = 0.7, 4.3
@@ -41,7 +41,7 @@ class Door:
     aside: float
     """Metres from the middle of the wall, towards +x or +y of the room."""
     to: int
-    """Room behind it."""
+    """Index of the room behind it."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Suite:
 
     @staticmethod
     def for_walk(frames: int, seed: int = 0) -> "Suite":
-        """The suite that a walk of so many frames goes round once, to end where it began.
+        """The suite that a walk of ``frames`` goes round once, to end where it began.
 
-        About a tenth of the frames see the first rooms again, unless the frames are few.
+        About a tenth of the frames see the first rooms again, unless there are few frames.
         """
         rooms = 2 * round(0.9 * frames * STEP / _LENGTH_PER_ROOM / 2)
         return Suite(max(rooms, 4), seed)
@@ -71,30 +71,30 @@ class Suite:
         return (room, 0) if room < columns else (self.rooms - 1 - room, 1)
 
     def origin(self, room: int) -> Float64[np.ndarray, "3"]:
-        """Where the corner of a room lies in the world."""
+        """World position of the corner of a room."""
         column, row = self.cell(room)
         return np.array([column * (ROOM[0] + WALL), row * (ROOM[1] + WALL), 0.0])
 
     def doors(self, room: int) -> tuple[Door, Door]:
-        """To the room before and to the one after."""
+        """Doors to the previous and to the next room."""
         return (self._door(room, room - 1, room - 1), self._door(room, room + 1, room))
 
     def _door(self, room: int, other: int, number: int) -> Door:
         (x, y), (u, v) = self.cell(room), self.cell(other)
         wall = {(1, 0): 1, (-1, 0): 3, (0, 1): 2, (0, -1): 0}[u - x, v - y]
         number %= self.rooms
-        # Doors take turns, so that one does not see through all of them.
+        # Doors alternate sides, so that one does not see through all of them.
         aside = _ASIDE * (-1) ** number * np.random.default_rng([self.seed, number]).uniform(0.6, 1)
         return Door(wall, float(aside), other % self.rooms)
 
     def door_centre(self, room: int, door: Door) -> Float64[np.ndarray, "2"]:
-        """In the middle of the wall's thickness, in the world."""
+        """Centre of a door, in the middle of the wall's thickness, world."""
         middle, out = ROOM[:2] / 2, _outward(door.wall)
         along = np.abs(out[::-1]) * door.aside
         return self.origin(room)[:2] + middle + out * (middle + WALL / 2) + along
 
     def room(self, room: int) -> Scene:
-        """A furnished room in its own frame, open at its doors; the passage to the next is its."""
+        """A furnished room in its own frame, open at its doors, with the passage to the next."""
         rng = np.random.default_rng([self.seed, room % self.rooms, 0x5017])
         build = SceneBuilder(rng)
         materials = furniture.make_materials(build, rng)
@@ -116,7 +116,7 @@ class Suite:
         return build.build(ROOM)
 
     def nearest(self, point: Float64[np.ndarray, "3"]) -> int:
-        """The room that a point lies in, or is nearest to."""
+        """Index of the room that a point lies in, or is nearest to."""
         column = int(np.clip(round((point[0] - ROOM[0] / 2) / (ROOM[0] + WALL)), 0, None))
         row = int(np.clip(round((point[1] - ROOM[1] / 2) / (ROOM[1] + WALL)), 0, 1))
         column = min(column, self.rooms // 2 - 1)
@@ -125,8 +125,8 @@ class Suite:
     def walk(self, frames: int, pace: float = 1.0) -> Float64[np.ndarray, "n 4 4"]:
         """Camera-to-world poses round the ring, again and again; shorter walks begin longer ones.
 
-        From one frame to the next the camera goes ``pace`` times ``STEP``.
-        The camera looks along its way and from side to side, at eye level, a little shaken.
+        From one frame to the next the camera moves ``pace`` times ``STEP``. It looks along its path
+        and from side to side, at eye level, with a little shake.
         """
         path = _closed_path(self._waypoints())
         length = float(path.x[-1])
@@ -143,7 +143,7 @@ class Suite:
         return with_shake(T_wc, self.seed, np.arange(frames))
 
     def _waypoints(self) -> Float64[np.ndarray, "n 2"]:
-        """Round the ring, from the middle of the first room."""
+        """Waypoints round the ring, from the middle of the first room."""
         points: list[np.ndarray] = []
         for room in range(self.rooms):
             rng = np.random.default_rng([self.seed, room, 0xA7])
@@ -166,7 +166,7 @@ def _outward(wall: int) -> Float64[np.ndarray, "2"]:
 
 
 def _closed_path(points: Float64[np.ndarray, "n 2"]) -> CubicSpline:
-    """Positions by arc length, about, on a smooth way through the points and back to the first."""
+    """A smooth closed path through the points, approximately by arc length."""
     closed = np.concatenate([points, points[:1]])
     chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     rough = CubicSpline(chord, closed, bc_type="periodic")
@@ -178,7 +178,7 @@ def _closed_path(points: Float64[np.ndarray, "n 2"]) -> CubicSpline:
 
 
 def _wall_frame(build: SceneBuilder, wall: int) -> tuple[SceneBuilder, float]:
-    """x along the wall as seen from behind, y into the room; and the wall's width."""
+    """Frame of a wall (x along it as seen from behind, y into the room), and the wall's width."""
     w, d, _ = ROOM
     place = [(w / 2, 0.0), (w, d / 2), (w / 2, d), (0.0, d / 2)][wall]
     return build.at(*place, yaw=wall * math.pi / 2), float(w if wall % 2 == 0 else d)
@@ -187,7 +187,7 @@ def _wall_frame(build: SceneBuilder, wall: int) -> tuple[SceneBuilder, float]:
 def _papered(
     frame: SceneBuilder, image: np.ndarray, width: float, a: float, b: float, low: float
 ) -> None:
-    """The part of a wall from x = a to b and from ``low`` to the ceiling, with its part of the
+    """Add the part of a wall from x = a to b and from ``low`` to the ceiling, with its part of the
     paper."""
     h, (rows, columns) = float(ROOM[2]), image.shape[:2]
     left, right = (round(columns * (width / 2 - x) / width) for x in (b, a))

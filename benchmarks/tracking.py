@@ -1,10 +1,10 @@
-"""Whether the depths of a tracker are as far off as it says, by the true surface of a room.
+"""Calibration of a tracker's depth uncertainty, against the true surface of a room.
 
     python benchmarks/tracking.py SEQUENCE [--frames 150] [--every 12] [OPTIONS]
 
 SEQUENCE is in Replica layout with mesh.ply; OPTIONS are those of geogs run (--tracking.operator
-own). Keyframes are judged after the stream and after the adjustment of all of them; every so
-many-th one's depth. What ``geogs bench motions SEQUENCE`` says of the trajectory is left to it.
+own). Keyframes are scored after the stream and after the adjustment of all of them; depth only of
+every ``--every``-th one. ``geogs bench motions SEQUENCE`` scores the trajectory.
 """
 
 import argparse
@@ -29,7 +29,7 @@ BINS = 8
 
 
 def report(tracker: Tracker, sequence: Sequence, mesh: Path, every: int) -> None:
-    """Error of the keyframes' positions, and of their depths by the deviation that they claim."""
+    """Print the errors of keyframes' positions, and of depths over their standard deviations."""
     states = [tracker.keyframes[k] for k in tracker.segment.ids]
     T_wc = sequence.T_wc[[s.frame_index for s in states]]
     centres = np.stack([torch.linalg.inv(s.T_cw)[:3, 3].numpy() for s in states])

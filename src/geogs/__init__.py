@@ -73,7 +73,7 @@ find_kernel_folder()
 
 
 def __getattr__(name: str) -> Any:
-    """Import the public names when they are first used, so that the command line starts at once."""
+    """Import public names when they are first used, so that the command line starts quickly."""
     if name == "application":
         return import_module("geogs.application")
     if name not in _HOMES:

@@ -1,4 +1,4 @@
-"""Work in other threads than the one that frames come to."""
+"""Work in other threads than that of the frames."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ class BackgroundTask:
     """One piece of work at a time in a thread of its own."""
 
     def __init__(self, name: str) -> None:
-        """``name`` is the thread's."""
+        """``name``: name of the thread."""
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=name)
         self._work: Future[None] | None = None
 
@@ -25,24 +25,24 @@ class BackgroundTask:
         self._work = self._thread.submit(work)
 
     def wait(self) -> None:
-        """Wait until the work is done; raises what it has raised, once."""
+        """Wait until the work is done; re-raises its exception once."""
         work, self._work = self._work, None
         if work is not None:
             work.result()
 
 
 class PriorityGate:
-    """Lets short work that is urgent go before long work of another thread."""
+    """Lets short urgent work go before long work of another thread."""
 
     def __init__(self, longest: float) -> None:
-        """``longest``: seconds for which the long work waits at a time."""
+        """``longest``: longest wait of the long work at a time, seconds."""
         self._longest = longest
         self._is_free = threading.Event()
         self._is_free.set()
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """While urgent work is going on."""
+        """Context of urgent work."""
         self._is_free.clear()
         try:
             yield
@@ -50,5 +50,5 @@ class PriorityGate:
             self._is_free.set()
 
     def give(self) -> None:
-        """Wait until nothing is urgent; called between two parts of the long work."""
+        """Wait for urgent work; called between two parts of the long work."""
         self._is_free.wait(self._longest)

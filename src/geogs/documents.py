@@ -1,7 +1,7 @@
-"""Text, JSON and YAML files from strangers: plain files of bounded size; nothing expands or runs.
+"""Safe reading of untrusted text, JSON and YAML files: plain, of bounded size, never executed.
 
-No sentence about such a file repeats what is in it, so that none that was named by mistake or by
-somebody else's list is shown to anybody.
+No message about such a file repeats its content, so that nothing leaks from a file that was named
+by mistake or by somebody else's list.
 """
 
 import json
@@ -24,19 +24,19 @@ LARGEST_SETTINGS = 1 << 17
 """Bytes of a YAML document, whose reader is slow: a calibration, settings, a card."""
 
 _NUMBER = re.compile(r"(\d+)\.\w+")
-"""Names of files that are numbered, padded with zeros or not."""
+"""Names of numbered files, padded with zeros or not."""
 _DEEPEST = 50
-"""Groups within groups."""
+"""Deepest nesting of groups."""
 _LONGEST_MESSAGE = 200
 
 UNUSABLE = (
     ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
 )  # fmt: skip
-"""Errors that may come of using the values of a document that somebody made up."""
+"""Errors that invalid values in a document may cause."""
 
 
 def expanded(path: str | Path) -> Path:
-    """The path with ~ as the user's folder; unchanged where there is no such user."""
+    """Expand ~ to the user's folder; unchanged where there is no such user."""
     try:
         return Path(os.path.expanduser(path))
     except ValueError:  # a zero byte in the name of a user
@@ -44,7 +44,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
-    """The content of a plain file; a pipe or a device is not waited for.
+    """Read a plain file; a pipe or a device is not waited for.
 
     Raises:
         InputError: it is missing, no plain file, too large, or cannot be read.
@@ -60,7 +60,7 @@ def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
 
 @contextmanager
 def open_file(path: str | Path) -> Iterator[BufferedReader]:
-    """A plain file to be read; a pipe or a device is not waited for.
+    """Open a plain file for reading; a pipe or a device is not waited for.
 
     Raises:
         InputError: it is missing, no plain file, or cannot be read.
@@ -82,7 +82,7 @@ def open_file(path: str | Path) -> Iterator[BufferedReader]:
 
 
 def require_file(path: str | Path) -> Path:
-    """The path of a plain file, for a library that opens files by their names.
+    """Check the path of a plain file, for a library that opens files by their names.
 
     Raises InputError as of ``open_file``.
     """
@@ -91,18 +91,18 @@ def require_file(path: str | Path) -> Path:
 
 
 def first_file(paths: Iterable[Path]) -> Path | None:
-    """The first of some files that is there; none where none is."""
+    """Return the first of some files that exists, or None."""
     return next((path for path in paths if path.is_file()), None)
 
 
 def numbered(paths: Iterable[Path], pattern: re.Pattern[str] = _NUMBER) -> list[tuple[int, Path]]:
-    """Files by the number that a pattern finds in their names, ascending."""
+    """Sort files by the number that a pattern finds in their names."""
     matches = ((pattern.fullmatch(path.name), path) for path in paths)
     return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
-    """The text of a plain file in UTF-8, with or without a mark at its beginning.
+    """Read the text of a plain file in UTF-8, with or without a byte order mark.
 
     Raises:
         InputError: as of ``read_bytes``, or it is no text.
@@ -114,7 +114,7 @@ def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
 
 
 def read_json(path: str | Path) -> Any:
-    """The value of a JSON file.
+    """Read a JSON file.
 
     Raises:
         InputError: as of ``read_text``, or it is damaged.
@@ -128,7 +128,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """The value of a YAML file of plain values, without tags of programs and without aliases.
+    """Read a YAML file of plain values, without program tags and aliases.
 
     Raises:
         InputError: as of ``read_text``, or it is damaged.
@@ -137,13 +137,13 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def yaml_value(text: str, name: str) -> Any:
-    """The value of a YAML text, as of ``read_yaml``; ``name`` is what to call it in a sentence."""
+    """Parse a YAML text as ``read_yaml`` does; ``name`` is used in error messages."""
     import yaml
 
     class PlainLoader(yaml.SafeLoader):
         """Refuses aliases, by which a few lines can mean billions of values, and deep nesting.
 
-        Time would go with the square of the depth.
+        Time would grow with the square of the depth.
         """
 
         def fetch_more_tokens(self) -> Any:
@@ -166,14 +166,14 @@ def yaml_value(text: str, name: str) -> Any:
 
 
 def in_short(error: Exception | str) -> str:
-    """The first line of an error's message, printable and of limited length, for a sentence."""
+    """Return the first line of an error's message, printable and of limited length."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
     plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
     return plain if len(plain) <= _LONGEST_MESSAGE else f"{plain[:_LONGEST_MESSAGE]}..."
 
 
 def whole_number(value: Any) -> int:
-    """The value of a document as a whole number. Raises ValueError if it is none."""
+    """Convert a value of a document to a whole number. Raises ValueError if it is none."""
     number = float(value)
     if not (abs(number) < 2**53 and number == int(number)):
         raise ValueError("no whole number")

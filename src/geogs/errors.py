@@ -1,4 +1,4 @@
-"""The errors a user can meet. Each carries one sentence: what is wrong and what to do."""
+"""Errors shown to users. The message is one sentence: what is wrong and what to do."""
 
 
 class GeogsError(Exception):

@@ -1,4 +1,4 @@
-"""Images as programs give them, checked before anything changes."""
+"""Input images from programs, checked before anything changes."""
 
 from dataclasses import replace
 
@@ -18,13 +18,13 @@ def input_frame(
     index: int,
     previous: float | None,
 ) -> Frame:
-    """A frame of an image.
+    """Make a frame from an image.
 
     Args:
         image: RGB, uint8, undistorted, of the camera's size; or a frame of a source, which has
             checked it.
-        timestamp: seconds, later than ``previous``, the last frame's; of a frame, its own counts.
-            If none is given, images come 30 times a second.
+        timestamp: seconds, later than ``previous``, the last frame's; ignored for a frame, which
+            has its own. If None, images come 30 times a second.
         index: position in the stream.
 
     Raises InputError if the image cannot be used.

@@ -1,6 +1,6 @@
-"""Where numba keeps the kernels that it has compiled for the CPU.
+"""Cache folder of the kernels that numba has compiled for the CPU.
 
-It takes the folder of a kernel's source, or else one of the user's; where both can only be read, as
+Numba uses the folder of a kernel's source, or else one of the user's; where both are read-only, as
 in many containers, it raises an error.
 """
 
@@ -9,11 +9,11 @@ import stat
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
-"""Names another folder for numba; what the user set is kept."""
+"""Environment variable of numba's folder; a user's setting is kept."""
 
 
 def find_kernel_folder() -> None:
-    """Name a temporary folder where numba would find none that it can write to.
+    """Set a temporary folder where numba would find no writable one.
 
     It has to be called before numba is imported.
     """
@@ -22,7 +22,7 @@ def find_kernel_folder() -> None:
 
 
 def kernel_folder() -> Path:
-    """The folder in which numba keeps kernels, or one of several."""
+    """Return the folder in which numba keeps kernels, or one of several."""
     if VARIABLE in os.environ:
         return Path(os.environ[VARIABLE])
     return next(filter(can_be_written, _usual()), _usual()[-1])
@@ -35,17 +35,17 @@ def _usual() -> tuple[Path, Path]:
 
 
 def can_be_written(folder: Path) -> bool:
-    """Whether files can be made in a folder, which is made itself if need be."""
+    """Whether files can be made in a folder, existing or not."""
     there = next((f for f in (folder, *folder.parents) if f.exists()), None)
     return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
 def temporary_folder() -> Path:
-    """One folder for all processes of a user, if nobody else can write there; else a new one.
+    """Return one folder for all processes of a user if nobody else can write there, else a new one.
 
-    Who can write where kernels are kept can have programs run.
+    Whoever can write to the folder of kernels can have programs run.
     """
-    import tempfile  # a tenth of the time of ``geogs --version``, and seldom needed
+    import tempfile  # a tenth of the time of ``geogs --version``, and rarely needed
 
     user = os.getuid()
     folder = Path(tempfile.gettempdir()) / f"geogs-kernels-{user}"

@@ -1,10 +1,10 @@
 """Inlining of the functions that compiled kernels call.
 
-Of a function that two kernels call, each has a copy of its own, optimised with the kernel; the
-function itself has one more. All have the same name, and where LLVM does not inline them, whichever
-the process has loaded first serves all. Under ``fastmath`` the copies may round differently: then a
-kernel's results depend on what the process has compiled or called before, and on whether the kernel
-came from the disk. So what such kernels call is inlined, and kept nowhere by itself.
+If two kernels call a function, each has its own copy, optimised with the kernel; the function
+itself has one more. All have the same name, and where LLVM does not inline them, the copy that the
+process loads first serves all. Under ``fastmath`` the copies may round differently: then a kernel's
+results depend on what the process has compiled or called before, and on whether the kernel came
+from the disk. So functions called by such kernels are always inlined and never cached alone.
 """
 
 from collections.abc import Mapping
@@ -12,8 +12,8 @@ from typing import Any
 
 
 def inlined(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a function that such kernels call, by those of a kernel: LLVM has to inline it.
+    """Return a kernel's options changed for a function that it calls: LLVM has to inline it.
 
-    It is compiled anew with each kernel that the disk does not have, never taken from there.
+    It is compiled again with each kernel that is not cached on disk, and never cached itself.
     """
     return {**options, "cache": False, "forceinline": True}

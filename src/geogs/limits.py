@@ -1,8 +1,8 @@
-"""Limits on the numbers of stored records, said by the types of their fields.
+"""Limits on the numbers of stored records, given by the types of their fields.
 
-``Annotated`` gives a number or an array a :class:`~geogs.config.setting.Range`, or says that it is
-:data:`UNBOUNDED`, a pose (:data:`RIGID`), or a :class:`Reference` to a row of a table. Floats of
-which nothing is said are finite.
+``Annotated`` gives a number or an array a :class:`~geogs.config.setting.Range`, or marks it as
+:data:`UNBOUNDED`, a pose (:data:`RIGID`), or a :class:`Reference` to a row of a table. Floats
+without a mark are finite.
 """
 
 import math
@@ -17,17 +17,17 @@ from torch import Tensor
 from geogs.config.setting import Range
 
 FARTHEST = 1e12
-"""Lengths of a map, in its unit, and scales lie between its inverse and this."""
+"""Largest length of a map, in its unit, and largest scale; the inverse is the smallest."""
 MOST_IDS = 1 << 22
-"""Tables have a row for each number up to the largest: at two keyframes a second, 24 days."""
+"""Largest id: tables have a row for each id up to it. At two keyframes a second, 24 days."""
 MOST_COUNTED = 1 << 53
-"""Floats represent all whole numbers up to it."""
+"""Largest count: floats represent all whole numbers up to it."""
 _SQUARENESS = 1e-4
 """Largest error of an element of R R^T."""
 
 
 class _Unbounded:
-    """Infinite numbers are allowed, NaN is not."""
+    """Mark of numbers that may be infinite, but not NaN."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Reference:
-    """Numbers of rows of a table."""
+    """Mark of numbers that are rows of a table."""
 
     table: str
 
@@ -50,7 +50,7 @@ AT_LEAST_0 = Range(0, FARTHEST)
 POSITIVE = Range(1 / FARTHEST, FARTHEST)
 
 Id = Annotated[int, Range(0, MOST_IDS)]
-"""Unique number of a thing among its kind, such as a frame."""
+"""Unique number of an object among its kind, such as a frame."""
 KeyframeId = Annotated[int, Range(0, MOST_IDS), Reference("keyframes")]
 """Id of a keyframe that exists."""
 Number = Annotated[int, Range(0, MOST_COUNTED)]
@@ -61,7 +61,7 @@ Pose = Annotated[Float64[Tensor, "4 4"], RIGID]
 
 
 def holds(marks: tuple[object, ...], value: Any) -> bool:
-    """Whether a number or an array keeps to its marks; other values always do."""
+    """Whether a number or an array satisfies its marks; other values always do."""
     if isinstance(value, np.ndarray):
         value = torch.from_numpy(value)
     if isinstance(value, Tensor):

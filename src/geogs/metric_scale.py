@@ -1,4 +1,4 @@
-"""Metric scale of a map: from poses beside the images, a depth sensor, or a known length."""
+"""Metric scale of a map: from odometry poses, a depth sensor, or a known length."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from geogs.world.world import World
 
 
 def rescale(world: World, keyframes: KeyframeSet, scale: MetricScale) -> None:
-    """Multiply all lengths of the main map's poses and depths; disks follow the correction."""
+    """Scale all lengths of the main map's poses and depths; disks follow the correction."""
     shrunk = torch.eye(4, dtype=torch.float64)
     shrunk[:3, :3] /= scale.factor
     keyframes.correct(keyframes.moved(shrunk))
@@ -22,7 +22,7 @@ def rescale(world: World, keyframes: KeyframeSet, scale: MetricScale) -> None:
 
 
 def scale_by_odometry(main: Tracker) -> MetricScale | None:
-    """Scale that poses beside the images give; None without, or in the gauge of a saved map."""
+    """Return the scale from odometry poses; None without, or in the gauge of a saved map."""
     odometry = main.map.odometry
     found = odometry.found
     if found.scale is None or main.segment.fixed:

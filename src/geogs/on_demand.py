@@ -1,4 +1,4 @@
-"""Sequences too large for the memory: an element is there for as long as somebody holds it."""
+"""Sequences too large for the memory: an element exists only while it is referenced."""
 
 from collections.abc import Callable, Sequence
 from typing import Generic, SupportsIndex, TypeVar, overload
@@ -8,10 +8,10 @@ V = TypeVar("V")
 
 
 class OnDemand(Sequence[V], Generic[S, V]):
-    """Elements that are made, one by one and each time anew, when they are asked for.
+    """A sequence whose elements are made on each access.
 
-    Element ``i`` is ``make(items[i])``. Nothing is kept, so what goes through the sequence in order
-    has one element in memory at a time. A slice makes nothing yet.
+    Element ``i`` is ``make(items[i])``. Nothing is cached, so a loop over the sequence has one
+    element in memory at a time. A slice makes nothing yet.
     """
 
     def __init__(self, items: Sequence[S], make: Callable[[S], V]) -> None:

@@ -1,4 +1,4 @@
-"""Pose of the camera as it is known right after a frame."""
+"""Estimate of the camera's pose right after a frame."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,10 +13,10 @@ from geogs.world.segments import TrackState
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A frame's pose and what there is of the map by then.
+    """A frame's pose and the size of the map at that time.
 
-    Later frames, loops and the final adjustment move it: ``Slam.trajectory`` has the poses of all
-    frames as they are known by then.
+    Later frames, loops and the final adjustment change it: ``Slam.trajectory`` gives the current
+    poses of all frames.
     """
 
     state: TrackState
@@ -26,9 +26,9 @@ class PoseEstimate:
     timestamp: float = nan
     """Seconds."""
     T_cw: Float64[np.ndarray, "4 4"] | None = field(default=None, compare=False)
-    """World to camera; none unless the camera is tracked in the main map."""
+    """World to camera; None unless the camera is tracked in the main map."""
     deviation: DeviationOf | None = field(default=None, repr=False, compare=False)
-    """Computes the deviation of the pose; none where nothing is known of it."""
+    """Function for the standard deviations of the pose; None where they are unknown."""
 
     @property
     def T_wc(self) -> Float64[np.ndarray, "4 4"] | None:
@@ -43,12 +43,12 @@ class PoseEstimate:
     @property
     def sigma_position(self) -> float:
         """Standard deviation of the camera's centre relative to the map around it, map units, all
-        axes together; infinite where nothing is known of it."""
+        axes together; infinite where unknown."""
         return inf if self._deviation is None else float(self._deviation.position)
 
     @property
     def sigma_rotation(self) -> float:
-        """Standard deviation of its orientation, radians; infinite where nothing is known of it."""
+        """Standard deviation of its orientation, radians; infinite where unknown."""
         return inf if self._deviation is None else float(self._deviation.rotation)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The disk map from images with known poses: find the scene, search depths, grow, train."""
+"""Disk map from images with known poses: find the scene, search depths, grow, train."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -27,28 +27,28 @@ from geogs.world.keyframes import KeyframeTable
 from geogs.world.map import MapTable
 
 OUTPUT_RATIO = 0.2
-"""Fraction of a given time that is kept for the mesh and the report until a few views have shown
-what these take."""
+"""Fraction of the time budget reserved for mesh and report until their time has been measured on a
+few views."""
 
 
 @dataclass(eq=False)
 class ReconstructionTable:
-    """All that the work of a reconstruction has come to, beside its images."""
+    """State of a reconstruction, except its images."""
 
     map: MapTable
     frame: MapFrame
     """Frame in which the map is made."""
     images: list[int]
-    """Places in their source of the images, as they were added."""
+    """Indices of the images in their source, in the order in which they were added."""
     seconds: float = 0.0
-    """Spent since the images had been read, when the table was settled."""
+    """Seconds since the images were read, when the table was settled."""
 
 
 class Reconstruction:
     """Dense reconstruction without tracking: add posed images, finish, read the map.
 
     Poses and the map are in the unit of the given poses. With a ``budget`` in seconds, counted from
-    now on, training takes the time that the depths leave of it.
+    the start, training takes the time that the depths leave of it.
     """
 
     def __init__(
@@ -69,9 +69,9 @@ class Reconstruction:
         self._poses: list[Float[Tensor, "4 4"]] = []
         """World-to-camera poses as given."""
         self._all: Trajectory | None = None
-        """Poses of images that were not added, too."""
+        """Poses of all images, including those that were not added."""
         self._begin: float | None = None
-        """When all images were there, by ``time.perf_counter``."""
+        """Time when all images had been added, by ``time.perf_counter``."""
         self._work_on(ReconstructionTable(MapTable.empty(device, self.config.seed), WORLD, []))
 
     def _work_on(self, table: ReconstructionTable) -> None:
@@ -81,7 +81,7 @@ class Reconstruction:
         self._stage = PosedMapping(self.mapper, config.search, self.budget, config.seed)
 
     def know(self, poses: Trajectory) -> None:
-        """Poses of all images of a set, some of which are going to be added."""
+        """Set the poses of all images of a set, of which some will be added."""
         self._all = poses
 
     @on_one_torch_thread
@@ -93,8 +93,8 @@ class Reconstruction:
         timestamp: float | None = None,
         index: int | None = None,
     ) -> None:
-        """An RGB image, its world-to-camera pose, which pixels count, seconds (or its number), and
-        its place in the set that it is from (or how many were added before it)."""
+        """Add an RGB image with its world-to-camera pose, mask of valid pixels, time in seconds
+        (default: its index), and index in its set (default: number of images added before)."""
         index = self.views if index is None else index
         seconds = float(index) if timestamp is None else timestamp
         with self.stopwatch("preparing"):
@@ -112,15 +112,15 @@ class Reconstruction:
         progress: StageProgress = unwatched,
         more: More | None = None,
     ) -> None:
-        """Depths of all images, the map from them, training; ``points`` of the scene help.
+        """Search depths of all images, make the map and train it; ``points`` of the scene help.
 
-        An exception raised by ``progress`` ends it early; the depths found by then make the map.
-        Where there is a budget, ``more`` is called when some depths have been searched. It may set
-        the ``output_cost`` of the budget, then ask for how many further images the time lasts, and
-        add them.
+        An exception raised by ``progress`` ends it early; the map is made from the depths so far.
+        With a budget, ``more`` is called when some depths have been searched. It may set the
+        ``output_cost`` of the budget, then ask how many further images fit into the time, and add
+        them.
 
         Raises:
-            InputError: too few images, or no two of them show the same thing from two places.
+            InputError: too few images, or no two of them show the same scene from two positions.
         """
         if self.views < 2:
             raise InputError(f"There is only {self.views} image; depth needs at least two.")
@@ -147,7 +147,7 @@ class Reconstruction:
         self._train(progress)
 
     def settle(self) -> ReconstructionTable:
-        """The work so far, to be packed and to ``resume`` from; there is some once "growing" was
+        """Return the state, to be packed and to ``resume`` from; valid once "growing" was
         reported."""
         self.mapper.settle()
         self.table.seconds = self.elapsed
@@ -155,9 +155,9 @@ class Reconstruction:
 
     @on_one_torch_thread
     def resume(self, table: ReconstructionTable, progress: StageProgress = unwatched) -> None:
-        """Instead of ``finish``, with the same images and settings: go on from the work of another.
+        """Continue from a saved state instead of ``finish``, with the same images and settings.
 
-        The time that it took counts.
+        The time spent before counts.
         """
         self._begin = time.perf_counter() - table.seconds
         self.budget.count_spent(table.seconds)
@@ -166,7 +166,7 @@ class Reconstruction:
         self._train(progress, goes_on=True)
 
     def _place_keyframes(self) -> None:
-        """Give the keyframes their poses in the map's frame."""
+        """Set the poses of the keyframes in the map's frame."""
         for keyframe, T_cw in zip(self._keyframes, self._poses, strict=True):
             keyframe.T_cw = self.table.frame.pose(T_cw)
 
@@ -178,57 +178,56 @@ class Reconstruction:
         with self.stopwatch("training"):
             self._stage.train(lambda f: progress("training", f), goes_on)
 
-    # --- what can be asked at any time --------------------------------------------------------
+    # --- results, available at any time -------------------------------------------------------
 
     @property
     def frames(self) -> int:
-        """Images whose poses are known, whether they were added or not."""
+        """Number of images with known poses, added or not."""
         return len(self._poses) if self._all is None else len(self._all.timestamps)
 
     @property
     def views(self) -> int:
-        """Images added so far."""
+        """Number of images added so far."""
         return len(self._poses)
 
     @property
     def with_depth(self) -> int:
-        """Images whose depth has been searched: those that make the map."""
+        """Number of images whose depth has been searched, from which the map is made."""
         return len(self.mapper.table.mapped)
 
     @property
     def elapsed(self) -> float:
-        """Seconds since all images were there: since ``finish`` was called."""
+        """Seconds since all images had been added (``finish`` was called)."""
         return 0.0 if self._begin is None else time.perf_counter() - self._begin
 
     def trajectory(self) -> Trajectory:
-        """The given poses of all images."""
+        """Return the given poses of all images."""
         return self.keyframe_trajectory() if self._all is None else self._all
 
     def keyframe_trajectory(self) -> Trajectory:
-        """The given poses of the images that make the map, or of all that were added while there is
-        none, in the order of their set."""
+        """Return the given poses of the mapped images, or of all that were added while there is no
+        map, in the order of their set."""
         order = self._in_order(self.mapper.table.mapped or range(self.views))
         times = [self._keyframes[i].timestamp for i in order]
         T_wc = torch.linalg.inv(torch.stack([self._poses[i] for i in order])).numpy()
         return Trajectory(np.array(times, np.float64), T_wc, np.ones(len(times), dtype=bool))
 
     def uncertainty(self) -> Uncertainty | None:
-        """Nothing: the poses were given."""
+        """Return None: the poses were given."""
         return None
 
     def snapshot(self) -> MapSnapshot:
-        """The disks as they are now."""
+        """Return the present disks."""
         return self.table.frame.world_snapshot(self.mapper.table.disks.snapshot())
 
     @on_one_torch_thread
     def renders(
         self, disks: MapSnapshot | None = None, of: Sequence[int] | None = None
     ) -> Sequence[RenderedKeyframe]:
-        """Depth, normal and reliability of the map seen from every image, inside its mask.
+        """Render depth, normal and confidence of the map from every image, inside its mask.
 
-        From some keyframes alone, where these are given by id; of an earlier snapshot's disks
-        where they are given. Rendered now; of many images most are read from a temporary file when
-        they are asked for.
+        ``of``: ids of the keyframes, instead of all; ``disks``: an earlier snapshot to render.
+        Rendered now; if there are many images, most are read from a temporary file on access.
         """
         with self.stopwatch("rendering"):
             earlier = None if disks is None else self.table.frame.map_snapshot(disks)
@@ -236,21 +235,20 @@ class Reconstruction:
             return self._in_world(self.mapper.renders(earlier, chosen))
 
     def renderer(self) -> MapRenderer:
-        """What shows the map as it is now from anywhere."""
+        """Return a renderer of the present map for any view."""
         return self.mapper.renderer(self.table.frame)
 
     def rows(self) -> dict[int, SeenRows]:
-        """None: poses that were given are those of whole images."""
+        """Return no rows: given poses are those of whole images."""
         return {}
 
     def statistics(self) -> dict[str, object]:
-        """Nothing that is not said of every result."""
+        """Return no statistics beyond those of every result."""
         return {}
 
     def depth_maps(self, of: Sequence[int] | None = None) -> Sequence[RenderedKeyframe]:
-        """Depth and confidence of every image, or of some keyframes, as searched, without disks.
-
-        Each is read when it is asked for, as it is at that time.
+        """Return the searched depth and confidence of every image, or of some keyframes, without
+        disks. Each is read on access.
         """
         chosen = self._in_order(self.mapper.table.mapped if of is None else of)
         return self._in_world(self.mapper.depth_maps(chosen))
@@ -262,5 +260,5 @@ class Reconstruction:
         )
 
     def _in_order(self, keyframe_ids: Iterable[int]) -> list[int]:
-        """Keyframes in the order of their images in the set."""
+        """Sort keyframes by the order of their images in the set."""
         return sorted(keyframe_ids, key=lambda i: self.table.images[i])

@@ -12,14 +12,14 @@ from geogs.world.keyframes import Keyframe
 
 @dataclass(frozen=True, eq=False)
 class SceneMask:
-    """A mask of all images, and whether black pixels of each are masked out."""
+    """A mask for all images, and whether black pixels are masked out, too."""
 
     fixed: Bool[np.ndarray, "h w"] | None = None
-    """True where images may show the scene; None takes all."""
+    """True where images may show the scene; None for all pixels."""
     black_is_masked: bool = False
 
     def of(self, keyframe: Keyframe) -> Bool[np.ndarray, "h w"] | None:
-        """Valid pixels of a keyframe; None where all are.
+        """Return the valid pixels of a keyframe; None where all are.
 
         Pixels of a straightened image that the lens did not see are not valid.
         """
@@ -34,6 +34,6 @@ class SceneMask:
         return None if valid.all() else valid
 
     def _straight(self, view: StraightView) -> Bool[np.ndarray, "h w"] | None:
-        """Valid pixels of straightened images; None where all are."""
+        """Return the valid pixels of straightened images; None where all are."""
         valid = view.is_seen if self.fixed is None else view.is_seen & view.nearest(self.fixed)
         return None if valid.all() else valid

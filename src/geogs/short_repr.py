@@ -1,4 +1,4 @@
-"""Records on one line of a prompt: arrays by their shape."""
+"""One-line representation of records: arrays by their shape."""
 
 from dataclasses import fields
 from typing import Any, ClassVar

@@ -36,9 +36,9 @@ from geogs.world.world import World, check_world
 class Slam(SlamOutput):
     """Dense monocular SLAM: feed images, read poses at once, and trajectory, map and depth maps.
 
-    What it knows is ``world``; its stages, ``segments`` (tracking), ``loops`` and the mapper of its
-    ``executor``, take the world one step on. Poses are world to camera, in a unit of the map's own,
-    or in metres where frames come with the depth that a sensor measured.
+    Its state is ``world``; its stages, ``segments`` (tracking), ``loops`` and the mapper of its
+    ``executor``, update the world. Poses are world to camera, in an arbitrary unit, or in metres
+    where frames come with sensor depth.
     """
 
     def __init__(
@@ -54,25 +54,25 @@ class Slam(SlamOutput):
         world: World | None = None,
         focal_deviation: float = 0.0,
     ) -> None:
-        """A system that has seen nothing, or goes on with the ``world`` of another.
+        """Start a new system, or continue with the ``world`` of another.
 
         Args:
             camera: pinhole of all images, which are undistorted.
             device: auto (a GPU where there is one), cpu, cuda or cuda:1.
-            prior: sees every keyframe.
+            prior: monocular prior, applied to every keyframe.
             live: return from :meth:`process` when the pose is known, and do the rest in threads;
                 else results are the same each time on a CPU.
             mask: true where images may show the scene; nothing else is matched, searched or mapped,
-                nor, with ``black_is_masked``, what is quite black in an image.
-            defers_map: make the map in :meth:`refine`, of all keyframes at their final poses;
-                ``mapping.when`` may say otherwise.
-            focal_deviation: relative standard deviation of the focal length where nobody said what
-                lens took the images, and it was found in the video or guessed; it is found once
-                more of all matches at the end then.
+                nor, with ``black_is_masked``, black pixels of an image.
+            defers_map: make the map in :meth:`refine`, from all keyframes at their final poses,
+                unless ``mapping.when`` rules it out.
+            focal_deviation: relative standard deviation of a focal length that was not given, but
+                estimated from the video or guessed; it is then estimated again from all matches at
+                the end.
 
         Raises:
             InputError: images of that size cannot be tracked, the camera is no pinhole, or the
-                world is of another camera.
+                world belongs to another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
         self.config = c = config or Config()
@@ -99,13 +99,13 @@ class Slam(SlamOutput):
                 self.executor = (Deferred if self.world.maps_at_end else InOrder)(*parts)
         self.world.map = self.executor.mapper.table
         self.pose: PoseEstimate | None = None
-        """Estimate after the last frame; none before the first."""
+        """Estimate after the last frame; None before the first."""
 
     @on_one_torch_thread
     def process(
         self, image: Frame | np.ndarray | torch.Tensor, timestamp: float | None = None
     ) -> PoseEstimate:
-        """Take the next image, as :func:`input_frame` does; returns where the camera is."""
+        """Process the next image, see :func:`input_frame`; return the camera's pose."""
         world = self.world
         if world.is_ended:
             raise InputError("The stream has ended by finish(); save it, and load it to go on.")
@@ -117,7 +117,7 @@ class Slam(SlamOutput):
         return self.pose
 
     def _advance(self, tracked: TrackResult, is_last: bool = False) -> None:
-        """Close loops after tracking, let the map follow, map what became final."""
+        """Close loops after tracking, correct the map, map keyframes that became final."""
         with self.stopwatch("loops"):
             joined = self.loops.update(tracked, is_last)
         self._update_map()
@@ -130,14 +130,14 @@ class Slam(SlamOutput):
             self.adjust()
 
     def _update_map(self) -> None:
-        """Let the map follow the corrections of the keyframes."""
+        """Apply the corrections of the keyframes to the map."""
         for correction in self.segments.main.keyframes.take_corrections():
             with self.stopwatch("map update"):
                 self.executor.mapping.correct(correction)
 
     @on_one_torch_thread
     def end_stream(self) -> None:
-        """Map what waits after the last frame. What there is then is the online result."""
+        """Map the remaining keyframes after the last frame. This is the online result."""
         with self.stopwatch("waiting"):
             self.settle()
         self.world.is_ended = True
@@ -155,7 +155,7 @@ class Slam(SlamOutput):
 
     @on_one_torch_thread
     def adjust(self, progress: StageProgress = unwatched) -> None:
-        """Bundle-adjust all keyframes and let the map follow."""
+        """Bundle-adjust all keyframes and correct the map."""
         main = self.segments.main
         if not main.segment.ids:
             return
@@ -170,9 +170,9 @@ class Slam(SlamOutput):
 
     @on_one_torch_thread
     def refine(self, progress: StageProgress = unwatched, seconds: float | None = None) -> None:
-        """Train the map over all keyframes, or make it of them where it was deferred.
+        """Train the map over all keyframes, or make it from them where it was deferred.
 
-        In about so many ``seconds``, as after an interruption, only where there is no map yet.
+        With limited ``seconds``, as after an interruption, only where there is no map yet.
         """
         label = "mapping" if self.executor.maps_at_end else "map refinement"
         self.executor.refine(self.world.unmapped, partial(progress, label), seconds)
@@ -180,9 +180,9 @@ class Slam(SlamOutput):
 
     @on_one_torch_thread
     def finish(self, progress: StageProgress = unwatched, correct: bool = True) -> None:
-        """End the stream if need be, adjust all keyframes, refine the map, bring it to metres.
+        """End the stream if needed, adjust all keyframes, refine the map, convert it to metres.
 
-        ``correct=False`` (after an interruption) keeps the online result as it stands.
+        ``correct=False`` (after an interruption) keeps the online result.
         """
         if not self.world.is_ended:
             self.end_stream()
@@ -193,22 +193,22 @@ class Slam(SlamOutput):
 
     @on_one_torch_thread
     def place_found(self, found: FoundFrames) -> None:
-        """Place frames that had no place, and were found beside those that have one."""
+        """Insert lost frames that were relocalised."""
         self.segments.place_found(found)
         if self.world.uncertainty is not None:
             self.world.uncertainty = self.world.uncertainty.with_found(found)
 
     @on_one_torch_thread
     def rescale(self, scale: MetricScale) -> None:
-        """Multiply all lengths of poses, depths and map, after which they are metres."""
+        """Convert all lengths of poses, depths and map to metres."""
         self.settle()
         rescale(self.world, self.segments.main.keyframes, scale)
         self._update_map()
 
     def to_metres(self) -> None:
-        """Bring the map to metres where poses beside the images say by which factor.
+        """Convert the map to metres where odometry poses determine its scale.
 
-        What is in metres already stays, and so does a saved map that it goes on in.
+        A map in metres, or one that continues a saved map, is left unchanged.
         """
         scale = None if self.metric_scale else scale_by_odometry(self.segments.main)
         if scale is not None:

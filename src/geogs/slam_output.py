@@ -1,4 +1,4 @@
-"""What can be asked of a SLAM system at any time."""
+"""Results of a SLAM system, available at any time."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -36,11 +36,11 @@ from geogs.world.world import World
 
 
 class SlamOutput:
-    """Reads the world; changes nothing of it."""
+    """Reads the world without changing it."""
 
     config: Config
     world: World
-    """All that is known."""
+    """State of the system."""
     segments: Segments
     loops: LoopCloser
     executor: InOrder
@@ -53,7 +53,7 @@ class SlamOutput:
 
     @property
     def frames(self) -> int:
-        """Images so far."""
+        """Number of images so far."""
         return self.world.frames
 
     @property
@@ -63,9 +63,9 @@ class SlamOutput:
 
     @property
     def metric_scale(self) -> MetricScale | None:
-        """What makes lengths metres: a known length, or a depth sensor; None where they are not.
+        """Metric scale, from a known length or a depth sensor; None if lengths are not metres.
 
-        All depths of a sensor share a part of their error, which is the scale's.
+        A part of the error of sensor depths is common to all: it is the error of the scale.
         """
         if self.world.metric_scale is not None or not self.segments.main.segment.is_metric:
             return self.world.metric_scale
@@ -73,22 +73,22 @@ class SlamOutput:
 
     @property
     def lens(self) -> FoundLens | None:
-        """What the last adjustment found that images bend beside what was said of the lens; poses,
-        keyframes and map are without it."""
+        """Distortion that the last adjustment estimated beyond the given calibration; poses,
+        keyframes and map are corrected for it."""
         return self.world.keyframes.lens
 
     @property
     def T_cw(self) -> Float64[Tensor, "4 4"] | None:
-        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        """Last known pose, world to camera, in whatever segment; None before the first."""
         return self.executor.T_cw
 
     @on_one_torch_thread
     def settle(self) -> None:
-        """Wait until the world holds all that the last frame brings."""
+        """Wait until the world includes all results of the last frame."""
         self.executor.settle()
 
     def settled(self) -> World:
-        """The world with all that threads have found, to be packed before the next frame."""
+        """Return the world with the results of all threads, to be packed before the next frame."""
         self.settle()
         self.segments.settle()
         self.loops.settle()
@@ -97,13 +97,13 @@ class SlamOutput:
 
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
-        """Poses of all frames so far."""
+        """Return the poses of all frames so far."""
         self.settle()
         with self.stopwatch("trajectory"):
             return self.segments.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
-        """Poses of the keyframes alone."""
+        """Return the poses of the keyframes alone."""
         self.settle()
         keyframes = [self.world.keyframes[i] for i in self.segments.main.segment.free]
         T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
@@ -111,17 +111,17 @@ class SlamOutput:
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
 
     def uncertainty(self) -> Uncertainty | None:
-        """How well the tracked frames are known, by all matches of the last adjustment.
+        """Return the standard deviations of tracked frames, by all matches of the last adjustment.
 
-        None before that: what is left of the matches until then are the latest alone. Where no map
-        could be started there is no keyframe, and nothing is known.
+        None before that: until then only the latest matches are kept. Empty where no map could be
+        started.
         """
         if self.world.is_ended and not self.segments.keyframe_ids:
             return Uncertainty(*4 * (np.zeros(0),))
         return self.world.uncertainty
 
     def statistics(self) -> dict[str, object]:
-        """What a summary says of segments, loops and things that move, ready for JSON."""
+        """Return statistics of segments, loops and moving objects for the summary, as JSON."""
         self.settle()
         return {
             "refined": self.world.is_refined,
@@ -137,13 +137,13 @@ class SlamOutput:
         }
 
     def _placed_afterwards(self) -> dict[str, object]:
-        """How many frames were lost and placed after the stream; nothing where none was."""
+        """Return the number of frames relocalised after the stream; empty where there are none."""
         records = self.segments.main.map.recorder.log.records
         found = sum(record.is_found for record in records)
         return {"placed_afterwards": found} if found else {}
 
     def _pose_agreement(self) -> dict[str, object] | None:
-        """How far poses beside the images fit them; none where there are none."""
+        """Return the agreement of odometry poses with the images; None where there are none."""
         agreement = self.segments.main.map.odometry.agreement()
         if not agreement.motions:
             return None
@@ -154,7 +154,7 @@ class SlamOutput:
         }
 
     def rows(self) -> dict[int, SeenRows]:
-        """When and where the rows of keyframes, by id, were seen, for those that were rectified."""
+        """Return the :class:`SeenRows` of rectified keyframes, by id."""
         segment = self.segments.main.segment
         known, view_of = segment.frames.rows, segment.keyframes.table.view_of
         seen = [(k.id, known[k.frame_index]) for k in segment.keyframes if k.frame_index in known]
@@ -164,25 +164,25 @@ class SlamOutput:
     # --- the map -------------------------------------------------------------------------------
 
     def snapshot(self) -> MapSnapshot:
-        """The disks as they are now."""
+        """Return the present disks."""
         return self.executor.ask(lambda mapper: mapper.table.disks.snapshot())
 
     @on_one_torch_thread
     def renders(self) -> Sequence[RenderedKeyframe]:
-        """Depth, normal and reliability of the map as it is now, seen from every mapped keyframe.
+        """Render depth, normal and confidence of the present map from every mapped keyframe.
 
-        Of a long video most are read from a temporary file when they are asked for.
+        For a long video most are read from a temporary file on access.
         """
         with self.stopwatch("rendering"):
             return self.executor.ask(Mapper.renders)
 
     def renderer(self) -> MapRenderer:
-        """What shows the map as it is now from anywhere."""
+        """Return a renderer of the present map for any view."""
         return self.executor.ask(Mapper.renderer)
 
     @on_one_torch_thread
     def render(self, T_cw: GivenPose, camera: Camera | None = None) -> RenderedView:
-        """The map as it is now, seen from a pose; as :meth:`MapRenderer.render`.
+        """Render the present map from a pose; as :meth:`MapRenderer.render`.
 
         Raises InputError before there is a map.
         """
@@ -194,14 +194,14 @@ class SlamOutput:
         return self.renderer().render(T_cw, camera)
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
-        """Depth and confidence of every mapped keyframe as searched, without the disks.
+        """Return the searched depth and confidence of every mapped keyframe, without the disks.
 
-        Each is read when it is asked for, as it is at that time.
+        Each is read on access.
         """
         return self.executor.ask(Mapper.depth_maps)
 
     def _estimate(self, state: TrackState, timestamp: float) -> PoseEstimate:
-        """What is known right after a frame."""
+        """Return the pose estimate right after a frame."""
         counts = self.world.frames, len(self.segments.keyframe_ids), self.executor.disks
         in_main = self.segments.current is self.segments.main and state is TrackState.TRACKING
         T_cw = self.T_cw if in_main else None

@@ -11,7 +11,7 @@ StageProgress = Callable[[str, float], None]
 
 
 def unwatched(stage: str, fraction: float) -> None:
-    """Progress that nobody watches."""
+    """Ignore the progress."""
 
 
 @dataclass
@@ -19,13 +19,13 @@ class StageSeconds:
     """Seconds of each stage so far; mutable."""
 
     seconds: dict[str, float] = field(default_factory=dict)
-    """By stage."""
+    """Seconds by stage."""
     until_stream_end: float | None = None
-    """Sum over all stages up to the end of the stream; none before it."""
+    """Sum over all stages up to the end of the stream; None before it."""
 
 
 class _Here(threading.local):
-    """Flag of each thread by itself."""
+    """Flag of each thread."""
 
     is_aside = False
 
@@ -33,24 +33,24 @@ class _Here(threading.local):
 class Stopwatch:
     """``with stopwatch("tracking"): ...`` adds to that stage's seconds.
 
-    Inside another stage it adds nothing, nor does a thread that works ``aside``: the seconds of all
+    Inside another stage, or in a thread that works ``aside``, it adds nothing: the seconds of all
     stages never overlap.
     """
 
     def __init__(self, times: StageSeconds | None = None) -> None:
-        """Adds to ``times``."""
+        """``times``: seconds to add to."""
         self.times = times or StageSeconds()
         self._is_running = False
         self._here = _Here()
 
     @property
     def seconds(self) -> dict[str, float]:
-        """By stage."""
+        """Seconds by stage."""
         return self.times.seconds
 
     @property
     def until_stream_end(self) -> float | None:
-        """Seconds of all stages up to the end of the stream; none before it."""
+        """Seconds of all stages up to the end of the stream; None before it."""
         return self.times.until_stream_end
 
     @property
@@ -76,7 +76,7 @@ class Stopwatch:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Inside, this thread adds nothing: it works beside the one whose stages count."""
+        """Context in which this thread adds nothing: it works beside the one that is timed."""
         before, self._here.is_aside = self._here.is_aside, True
         try:
             yield

@@ -2,8 +2,8 @@
 
 PyTorch's OpenMP threads spin for a while after each operation. On a machine with few cores they
 take the cores that our kernels' threads need next, and a training step becomes several times
-slower (measured on two cores: tracking eleven times, mapping six). So kernels count their threads
-here, and PyTorch is held to one while they work.
+slower (measured on two cores: tracking eleven times, mapping six). So kernels use the threads of
+this module, and PyTorch is limited to one while they work.
 """
 
 import functools
@@ -24,7 +24,7 @@ P = ParamSpec("P")
 
 
 def available_cores() -> int:
-    """CPUs that this process may use."""
+    """Return the number of CPUs that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS
@@ -33,7 +33,7 @@ def available_cores() -> int:
 
 @functools.cache
 def worker_count() -> int:
-    """CPUs that this process may use, at most OMP_NUM_THREADS where that is set, at most 16."""
+    """Return the number of CPUs to use: at most OMP_NUM_THREADS, if set, and at most 16."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, min(available_cores(), int(wanted) if wanted.isdigit() else 16, 16))
 
@@ -43,10 +43,10 @@ def thread_map(
     items: Sequence[T],
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[R]:
-    """``list(map(function, items))`` over the workers; results in the order of the items.
+    """Run ``list(map(function, items))`` over the workers; results in the order of the items.
 
-    The caller's thread takes part, and reports the ``progress``, which may raise an exception as
-    any item may: items that are not begun yet are left.
+    The caller's thread takes part, and reports the ``progress``. After an exception, of an item or
+    of ``progress``, items that have not begun are skipped.
     """
     results: dict[int, R] = {}
     caller, reported = threading.get_ident(), 0
@@ -69,19 +69,19 @@ def thread_map(
 
 @runtime_checkable
 class Each(Protocol):
-    """``map``, or a function that computes the next results meanwhile."""
+    """``map``, or a function like it that computes the next results ahead."""
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T], /) -> Iterator[R]:
-        """The results in the order of the items."""
+        """Return the results in the order of the items."""
         ...
 
 
 def ordered_map(
     function: Callable[[T], R], items: Iterable[T], threads: int, name: str = ""
 ) -> Iterator[R]:
-    """``map(function, items)``; a few threads compute the next results meanwhile.
+    """Run ``map(function, items)``; a few threads compute the next results ahead.
 
-    No more items are taken than there are threads, beside the one that is asked for.
+    Besides the requested item, at most one item per thread is taken.
     """
     pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
     pending: deque[Future[R]] = deque()
@@ -99,8 +99,8 @@ def ordered_map(
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:
     """Call ``function(chunk)`` for every chunk; threads take the next one as they become free.
 
-    The caller's thread takes part. After an exception chunks that are not begun yet are left; it is
-    raised once all threads are done. Calls within calls share the threads.
+    The caller's thread takes part. After an exception, chunks that have not begun are skipped; it
+    is raised once all threads are done. Nested calls share the threads.
     """
     counter, failed = itertools.count(), False
 
@@ -123,7 +123,7 @@ def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> 
         work()
     finally:
         for future in futures:
-            # One that has not begun waits behind others' work, and there is nothing left to do.
+            # One that has not begun waits behind other work, and nothing is left for it to do.
             if not future.cancel():
                 future.result()
 
@@ -137,7 +137,7 @@ def over_rows(kernel: Callable[[int, int], object], height: int) -> None:
 
 @functools.cache
 def _executor(threads: int, process: int) -> ThreadPoolExecutor:
-    """One pool per process: threads do not survive a fork. PyTorch has one thread in each."""
+    """Return one pool per process: threads do not survive a fork. Each has one PyTorch thread."""
     return ThreadPoolExecutor(
         threads - 1, thread_name_prefix="geogs",
         initializer=torch.set_num_threads, initargs=(1,),
@@ -145,7 +145,7 @@ def _executor(threads: int, process: int) -> ThreadPoolExecutor:
 
 
 def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: PyTorch has one thread while the function runs."""
+    """Limit PyTorch to one thread while the decorated function runs."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -160,19 +160,19 @@ def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def opencv_on_one_thread() -> None:
-    """OpenCV computes in the caller's thread, process-wide: our own threads use the cores."""
+    """Limit OpenCV to the caller's thread, process-wide: our own threads use the cores."""
     import cv2
 
     cv2.setNumThreads(1)
 
 
 SWITCH_SECONDS = 0.0001
-"""Switch interval of Python's threads while tracking and mapping share the interpreter; the usual
-5 ms, several times a frame, would be felt."""
+"""Switch interval of Python's threads while tracking and mapping share the interpreter. The usual
+5 ms, several times a frame, would slow tracking."""
 
 
 class QuickSwitching:
-    """Threads take turns often between ``begin`` and ``end``: process-wide, for a live system."""
+    """Shortens the switch interval from ``begin`` to ``end``: process-wide, for live systems."""
 
     def begin(self) -> "QuickSwitching":
         """Shorten the interval."""
@@ -181,5 +181,5 @@ class QuickSwitching:
         return self
 
     def end(self) -> None:
-        """Set it back."""
+        """Restore the interval."""
         sys.setswitchinterval(self._before)

@@ -1,4 +1,4 @@
-"""Frozen records that the parts exchange."""
+"""Frozen records that the modules exchange."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -18,10 +18,10 @@ from geogs.short_repr import ShortRepr
 
 @runtime_checkable
 class MeasuredDepth(Protocol):
-    """Depth of a sensor, read when it is asked for."""
+    """Depth of a sensor, read on demand."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
-        """Depth z of every pixel, 0 where unknown; None where it cannot be read."""
+        """Return depth z of every pixel, 0 where unknown; None where it cannot be read."""
         ...
 
 
@@ -30,28 +30,28 @@ class MeasuredPose(ShortRepr):
     """Pose of the camera by another tracker."""
 
     T_cw: Pose
-    """World to camera, metres, in a world of its own."""
+    """World to camera, metres, in the tracker's own world."""
     world: int = 0
-    """Poses of different worlds cannot be compared."""
+    """Number of that world; poses of different worlds cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SeenRows(ShortRepr):
-    """Where and when a rolling shutter saw the pixels of an image whose rows were rectified.
+    """Offsets and times of the pixels of a rolling-shutter image whose rows were rectified.
 
     The nodes lie in the middle of each eight pixels, and a step beyond the border; the image was
     resampled by bilinear interpolation between them.
     """
 
     offset: Float16[Tensor, "r c 2"]
-    """Pixels from a node to where a pinhole with the camera's pose of that time saw the same."""
+    """Pixels from a node to where a pinhole with the camera's pose at that time sees the same."""
     seconds: Float16[Tensor, "r c"]
-    """Time of exposure from that of the middle row."""
+    """Time of exposure relative to the middle row."""
     doubt: float = 0.0
     """Relative standard error of the readout; 0 where it was given."""
     is_rectified: bool = True
-    """Otherwise rows are as they came, and ``seconds`` those of a readout of one standard error:
-    the shutter is assumed to be global, and may not be."""
+    """If false, rows were not changed and ``seconds`` are those of a readout of one standard error:
+    the shutter is assumed to be global, but may not be."""
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,22 @@ class FlowMatch:
     """Damping of the first image's inverse depth, in the units of its inverse variance; equal for
     all edges of a call that share the first image."""
     memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
-    """State of the flow operator for each edge, which it is given when it measures that again."""
+    """State of the flow operator for each edge, passed to it when the edge is measured again."""
 
     def on_cpu(self) -> "FlowMatch":
-        """Positions and weights alone, on the CPU."""
+        """Copy positions and weights to the CPU."""
         return FlowMatch(self.pixels.cpu(), self.weight.cpu())
 
     def sure(self) -> Bool[Tensor, "e p"]:
-        """Confident cells: matched along both axes with at least a hundredth of the weight of the
-        edge's best. A first geometry is estimated from these, where a guess would count like a
-        good match."""
+        """Return the confident cells: matched along both axes with at least a hundredth of the
+        weight of the edge's best. Initial geometry is estimated from these, as there a guess would
+        count as much as a good match."""
         weight = self.weight.amin(-1)
         best = torch.quantile(weight.float(), 0.98, dim=-1, keepdim=True)
         return (weight > 0) & (weight > 0.01 * best)
 
     def only_sure(self) -> "FlowMatch":
-        """Positions and weights, which are zero where a cell is not confident."""
+        """Return positions and weights, zero where a cell is not confident."""
         return FlowMatch(self.pixels, torch.where(self.sure()[..., None], self.weight, 0.0))
 
 
@@ -98,15 +98,15 @@ class Frame(ShortRepr):
     follows_cut: bool = False
     """Whether it begins another video, so that no motion links it to the frame before."""
     depth: MeasuredDepth | None = None
-    """Depth of the image's pixels, where a sensor measured it and it is to be used."""
+    """Sensor depth of the image's pixels, if it is to be used."""
     pose: MeasuredPose | None = None
-    """Prior by another tracker, where there is one and it is to be used."""
+    """Pose prior by another tracker, if it is to be used."""
     rows: SeenRows | None = None
-    """Rectification of its rows; none for a global shutter."""
+    """Rectification of its rows; None for a global shutter."""
     left: int | None = None
-    """Images of its recording that are still to come; none where that is not known."""
+    """Number of images of its recording still to come; None where unknown."""
     mask: Bool[np.ndarray, "h w"] | None = None
-    """Pixels that may show the scene; none where all do."""
+    """Pixels that may show the scene; None where all do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +116,19 @@ class PoseCorrection:
     before: dict[int, Float[Tensor, "4 4"]]
     after: dict[int, Float[Tensor, "4 4"]]
     scale: dict[int, float]
-    """Factor by which lengths around the keyframe were divided; 1 where only the pose moved."""
+    """Factor by which lengths around the keyframe were divided; 1 where only the pose changed."""
     of_all: bool = False
-    """Whether all keyframes were adjusted together; otherwise those before its first were not."""
+    """Whether all keyframes were adjusted; otherwise those before its first were not."""
 
 
 @dataclass(frozen=True, slots=True)
 class MetricScale:
-    """Factor by which the lengths of a map became metres."""
+    """Factor that converted the lengths of a map to metres."""
 
     origin: str
-    """Where it comes from."""
+    """Source of the scale."""
     factor: Positive
-    """All lengths were multiplied by it."""
+    """Factor on all lengths."""
     deviation: AtLeast0
     """Relative standard deviation of the factor."""
 
@@ -138,7 +138,7 @@ class FoundLens:
     """Distortion (OpenCV's k1 and k2) and focal length estimated from all matches, for images that
     were assumed to be those of a pinhole.
 
-    A ray x, y was seen at focal (1 + k1 r^2 + k2 r^4) times that, about a principal point.
+    A ray (x, y) was seen at focal (1 + k1 r^2 + k2 r^4) (x, y) from the principal point.
     """
 
     k1: float
@@ -147,20 +147,20 @@ class FoundLens:
     """Standard deviation."""
     deviation_k2: AtLeast0
     focal: Positive = 1.0
-    """Focal length over the assumed one; 1 where it was not estimated, or is right."""
+    """Focal length over the assumed one; 1 where it was not changed."""
     deviation_focal: AtLeast0 = 0.0
     right: float = 0.0
     down: float = 0.0
-    """Offset of the principal point from the assumed one, in the focal lengths found."""
+    """Offset of the principal point from the assumed one, in estimated focal lengths."""
     deviation_centre: AtLeast0 = 0.0
     varies_focal: AtLeast0 = 0.0
     varies_centre: AtLeast0 = 0.0
-    """Variation from frame to frame of the focal length, relative, and of the principal point, in
-    focal lengths; root mean square, zero where all frames are alike."""
+    """Root mean square variation from frame to frame of the focal length, relative, and of the
+    principal point, in focal lengths; zero for a constant lens."""
 
     @property
     def varies(self) -> bool:
-        """Whether frames have lenses of their own."""
+        """Whether intrinsics vary from frame to frame."""
         return self.varies_focal > 0 or self.varies_centre > 0
 
     @property
@@ -169,29 +169,29 @@ class FoundLens:
         return self.right != 0 or self.down != 0
 
     def of_frame(self, own: "FrameLens") -> "FoundLens":
-        """The lens of a frame with a deviation of its own."""
+        """Return the lens of a frame with intrinsics of its own."""
         focal = self.focal * math.exp(own.focal)
         return replace(self, focal=focal, right=self.right + own.right, down=self.down + own.down)
 
 
 @dataclass(frozen=True)
 class FrameLens:
-    """Deviation of the lens of one frame from that of all."""
+    """Intrinsics of one frame relative to the shared lens."""
 
     focal: float = 0.0
-    """Logarithm of its focal length over that of all."""
+    """Logarithm of its focal length over the shared one."""
     right: float = 0.0
     down: float = 0.0
-    """Offset of its principal point from theirs, in focal lengths."""
+    """Offset of its principal point from the shared one, in focal lengths."""
 
     @property
     def sizes(self) -> tuple[float, float, float]:
-        """All three."""
+        """All three values."""
         return self.focal, self.right, self.down
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]
-"""What is known of a frame: its pose, its orientation alone, or nothing."""
+"""Known part of a frame's pose: all of it, its orientation alone, or nothing."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -203,13 +203,13 @@ class Trajectory(ShortRepr):
     T_wc: Float[np.ndarray, "n 4 4"]
     """Camera to world, float64."""
     tracked: Bool[np.ndarray, "n"]
-    """False where the position is not known, but interpolated or held."""
+    """False where the position is not known, but interpolated or repeated."""
     oriented: Bool[np.ndarray, "n"] | None = None
-    """True where no more than the orientation is known; none where there is no such frame."""
+    """True where only the orientation is known; None where there is no such frame."""
 
     @property
     def states(self) -> list[FrameState]:
-        """What is known of each frame."""
+        """State of each frame."""
         only = np.zeros_like(self.tracked) if self.oriented is None else self.oriented
         return [
             "tracked" if t else "orientation only" if o else "lost"
@@ -217,37 +217,37 @@ class Trajectory(ShortRepr):
         ]
 
     def of(self, state: FrameState) -> "Trajectory":
-        """The frames of one state."""
+        """Return the frames of one state."""
         keep = np.array([known == state for known in self.states], bool)
         return Trajectory(self.timestamps[keep], self.T_wc[keep], self.tracked[keep])
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class FoundFrames(ShortRepr):
-    """Frames of a video that had no pose and were given one afterwards, in time order."""
+    """Frames of a video that were lost and relocalised afterwards, in time order."""
 
     numbers: tuple[int, ...]
-    """Indices of the frames in the video, one for each row of what follows."""
+    """Indices of the frames in the video, one for each row below."""
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
     T_cw: Float[np.ndarray, "n 4 4"]
     """World to camera, float64."""
     position: Float[np.ndarray, "n"]
-    """Standard deviation of the camera's centre relative to the frames that had a pose before, map
-    units; infinite where it is not known."""
+    """Standard deviation of the camera's centre relative to the frames tracked before, map units;
+    infinite where unknown."""
     rotation: Float[np.ndarray, "n"]
     """Standard deviation of the orientation, radians."""
 
     @staticmethod
     def none() -> "FoundFrames":
-        """No frames."""
+        """Return an empty set of frames."""
         return FoundFrames((), np.zeros(0), np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def of(self, kept: Bool[np.ndarray, "n"]) -> "FoundFrames":
-        """Those of the frames that are kept."""
+        """Return the frames where ``kept`` is true."""
         numbers = tuple(n for n, is_kept in zip(self.numbers, kept, strict=True) if is_kept)
         columns = (self.timestamps, self.T_cw, self.position, self.rotation)
         return FoundFrames(numbers, *(column[kept] for column in columns))
@@ -255,34 +255,34 @@ class FoundFrames(ShortRepr):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Uncertainty(ShortRepr):
-    """Standard deviations of frames, earliest first; infinite where nothing is known."""
+    """Standard deviations of frames, earliest first; infinite where unknown."""
 
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
     position: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
-    """Camera's centre, map units, all axes together: the error left after the trajectory is
-    aligned with the truth by a similarity."""
+    """Camera centre, map units, all axes together: the expected error after alignment of the
+    trajectory with the truth by a similarity."""
     rotation: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """Orientation, radians."""
     depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
-    """Depths, relative, where the trajectory is as long as the true one: those of the best known
-    15 % of what the frame sees, as bare walls say nothing."""
+    """Depth, relative, given a trajectory as long as the true one: of the best known 15 % of the
+    frame's cells, as bare walls do not determine depth."""
     focal: AtLeast0 = 0.0
     """Focal length, relative: the width of things over their depth."""
     misfit: AtLeast0 = 0.0
-    """Residuals of the tenth of the keyframes whose matches fit least, over those of the usual
-    keyframe; 0 where that is not known."""
+    """Residuals of the tenth of the keyframes whose matches fit worst, over those of a typical
+    keyframe; 0 where unknown."""
     focal_change: AtLeast0 = 0.0
-    """Relative difference of the focal lengths that parts of the video fit best."""
+    """Relative difference of the focal lengths that fit parts of the video best."""
     lens_change: AtLeast0 = 0.0
-    """Part of the cost of the matches that is left because the lens changes from frame to frame."""
+    """Fraction of the cost of the matches due to changes of the lens from frame to frame."""
     joined: Annotated[float, Range(0, 1)] = 1.0
-    """Fraction of the keyframes in the largest part that one rigid structure holds together."""
+    """Fraction of the keyframes in the largest rigidly connected part."""
     lens_varies: bool = False
-    """Whether lenses of the frames' own were found, and taken off the matches."""
+    """Whether per-frame intrinsics were estimated, and the matches corrected for them."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
-        """Interpolated in time, constant beyond the ends; infinite where there is nothing."""
+        """Interpolate in time, constant beyond the ends; infinite without any frame."""
         known = (self.position, self.rotation, self.depth)
         if not len(self.timestamps):
             position, rotation, depth = (np.full(len(timestamps), np.inf) for _ in known)
@@ -293,8 +293,8 @@ class Uncertainty(ShortRepr):
         )
 
     def with_found(self, found: FoundFrames) -> "Uncertainty":
-        """With frames that were found afterwards: their own deviations add to those of the frames
-        around them, as independent ones."""
+        """Add relocalised frames; their own deviations are added to those of the frames around
+        them, as independent ones."""
         around = self.at(found.timestamps)
         order = np.argsort(np.concatenate([self.timestamps, found.timestamps]), kind="stable")
         columns = (
@@ -317,7 +317,7 @@ class MapSnapshot(ShortRepr):
     scale: Float[Tensor, "n 2"]
     """Standard deviations along the two tangents, map units."""
     opacity: Float[Tensor, "n"]
-    """In (0, 1)."""
+    """Opacity in (0, 1)."""
 
     def __len__(self) -> int:
         return len(self.position)
@@ -328,7 +328,7 @@ class MapSnapshot(ShortRepr):
         return quaternion_to_matrix(self.quaternion)[..., 2]
 
     def in_world(self, origin: Float64[np.ndarray, "3"], unit: float) -> "MapSnapshot":
-        """The disks of a map whose origin lies there in the world, and whose unit is so long."""
+        """Transform the disks of a map with this ``origin`` and ``unit`` to the world."""
         position = self.position * unit + torch.from_numpy(origin).to(self.position)
         return MapSnapshot(position, self.quaternion, self.scale * unit, self.opacity)
 
@@ -340,7 +340,7 @@ class MapSnapshot(ShortRepr):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class RenderedKeyframe(ShortRepr):
-    """The map seen from a keyframe: what a surface is made from."""
+    """The map rendered from a keyframe: input of the surface reconstruction."""
 
     keyframe_id: int
     camera: Camera
@@ -348,14 +348,14 @@ class RenderedKeyframe(ShortRepr):
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
     depth: Float[Tensor, "h w"]
-    """Map units; 0 where the map is too thin to say."""
+    """Depth in map units; 0 where the map is too thin."""
     normal: Float[Tensor, "h w 3"]
-    """Camera frame, facing the camera, zero where there is no depth."""
+    """Normal in the camera frame, facing the camera; zero where there is no depth."""
     weight: Float[Tensor, "h w"]
     """Confidence of the depth in [0, 1]; less where disks spread along the ray."""
     image: UInt8[np.ndarray, "h2 w2 3"] | None
-    """RGB at working resolution; none in a result that was written without images."""
+    """RGB at working resolution; None in a result that was written without images."""
     timestamp: float
     """Seconds."""
     mask: Bool[Tensor, "h w"] | None = None
-    """Pixels that belong to the scene; none where all do."""
+    """Pixels that belong to the scene; None where all do."""

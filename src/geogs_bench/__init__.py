@@ -1,4 +1,4 @@
-"""Benchmarks: scenes of known data sets, run and scored in one go, beside the published figures."""
+"""Benchmarks: scenes of known data sets, run, scored and compared with the published figures."""
 
 from geogs.cli.command import Command
 

@@ -22,12 +22,12 @@ from geogs_bench.tables.benchmark_report import Chapter
 
 @dataclass(frozen=True)
 class BenchResult:
-    """The records of a benchmark, or of each of a suite, and where they are."""
+    """The records of a benchmark or of a suite, and their folder."""
 
     output: Path
     """Folder of the results."""
     chapters: list[Chapter]
-    """All records in the folder, earlier calls' included."""
+    """All records in the folder, with those of earlier calls."""
 
 
 def bench(settings: BenchOptions, say: Callable[[str], None]) -> BenchResult:
@@ -61,7 +61,7 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> BenchResult:
 
 
 def _data_of(settings: BenchOptions, suite: Suite) -> Path | None:
-    """The user's folder, where the suite takes one."""
+    """The user's data folder, if the suite takes one."""
     if settings.result is not None:
         raise InputError(f"--result is for {EDGES.name}; {suite.name} scores its own runs.")
     if settings.data is not None and not suite.takes_data:
@@ -70,7 +70,7 @@ def _data_of(settings: BenchOptions, suite: Suite) -> Path | None:
 
 
 def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> BenchResult:
-    """Score a result of earlier."""
+    """Score an earlier result."""
     if benchmark is not EDGES:
         raise InputError(f"--result is for {EDGES.name}; {benchmark.name} scores its own runs.")
     if settings.data is None:
@@ -85,7 +85,7 @@ def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> BenchR
 
 
 def _name(settings: BenchOptions) -> str:
-    """Name of the benchmark: some have another for a switch."""
+    """Name of the benchmark, which some switches change."""
     name = settings.name
     if settings.known_poses:
         if name not in ("rooms", "rooms-known-poses"):
@@ -100,7 +100,7 @@ def _name(settings: BenchOptions) -> str:
 
 
 def listing() -> str:
-    """Which benchmarks there are, what data each needs and where that comes from."""
+    """List the benchmarks with the data that each needs and its source."""
     lines = [
         "board",
         "  The whole on one page: commands on fixed sequences, three seeds each, beside a record",
@@ -145,7 +145,7 @@ def _names(text: str) -> tuple[str, ...]:
 def _made_data(
     benchmark: Benchmark, output: Path, scenes: Sequence[str], say: Callable[[str], None]
 ) -> Path:
-    """What can be rendered, where that serves. Raises InputError where it does not."""
+    """Render the data of a benchmark; return its folder. Raises InputError if it has none."""
     if benchmark.cells:
         return render_cells(benchmark.cells, output / "data", scenes, say)
     raise InputError(

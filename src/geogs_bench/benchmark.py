@@ -1,4 +1,4 @@
-"""What a benchmark is: scenes, variants of the settings, and the tables of its results."""
+"""Definition of a benchmark: scenes, variants of the settings, and the tables of its results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ class Variant:
     """One row of an ablation: a name, and the options that make it."""
 
     name: str = ""
-    """Also the folder below the scene's; none for a benchmark of one variant."""
+    """Also the name of the folder below the scene's; empty in a benchmark of one variant."""
     options: tuple[Option, ...] = ()
     command: Command | None = None
-    """Other than the benchmark's."""
+    """Command, if not the benchmark's."""
     needs_depth: bool = False
-    """Whether only scenes whose images come with the depth of a sensor have it."""
+    """Whether it runs only on scenes with the depth images of a sensor."""
 
 
 @dataclass(frozen=True)
 class Published:
-    """The published figures that stand beside a column."""
+    """The published figures beside a column."""
 
     table: PublishedTable
     metric: str
@@ -34,10 +34,10 @@ class Published:
 
 @dataclass(frozen=True)
 class Column:
-    """A number of each record."""
+    """A column of a table: a number of each record."""
 
     title: str
-    """``{unit}`` stands for that of the surfaces."""
+    """Title; ``{unit}`` is replaced by the unit of the surfaces."""
     value: Callable[[Record], float | None]
     digits: int = 2
     published: Published | None = None
@@ -45,7 +45,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Layout:
-    """A table of results: which numbers under which heading."""
+    """A table of results: its title and columns."""
 
     title: str
     columns: tuple[Column, ...]
@@ -61,31 +61,31 @@ class Benchmark:
     command: Command
     find: Callable[[Path], list[BenchmarkScene]]
     needs: str
-    """The folder that the user gives."""
+    """Description of the folder that the user gives."""
     source: str
-    """Where the data comes from."""
+    """Source of the data."""
     layouts: tuple[Layout, ...]
     variants: tuple[Variant, ...] = (Variant(),)
     scenes: tuple[str, ...] = ()
-    """Scenes of the paper; others are run only if asked for, or if none of these is there."""
+    """Scenes of the paper; others are run only by name, or if none of these is there."""
     published: tuple[PublishedTable, ...] = ()
     notes: tuple[str, ...] = ()
-    """What to know before comparing with the published figures."""
+    """Notes on the comparison with the published figures."""
     budgets: tuple[float, ...] = ()
     """Seconds given to each reconstruction from known poses; each makes a variant."""
     cells: tuple[Cell, ...] = ()
-    """Sequences that are rendered where the user gives no data."""
+    """Sequences that are rendered if the user gives no data."""
 
 
 @dataclass(frozen=True)
 class SuiteTable:
-    """A benchmark of a suite, and what stands in where the user has no data for it."""
+    """A benchmark of a suite, and its stand-ins if the user has no data for it."""
 
     benchmark: Benchmark
     find_stand_ins: Callable[[Path], list[BenchmarkScene]]
-    """In the folder of what was rendered."""
+    """Finds the stand-ins in the folder of the rendered sequences."""
     cells: tuple[Cell, ...]
-    """What is rendered."""
+    """Sequences to render."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,6 @@ class Suite:
     source: str
     tables: tuple[SuiteTable, ...]
     options: tuple[Option, ...] = ()
-    """Of every task."""
+    """Options of every task."""
     takes_data: bool = True
-    """Whether the user's data is looked for; else all are stand-ins."""
+    """Whether the user's data is used; else all scenes are stand-ins."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code: 0 if every scene was scored, else 2."""
+    """Run the command; return the exit code: 0 if every scene was scored, else 2."""
     options = parse_options(BenchOptions, argv, "bench")
 
     from rich.console import Console
@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _board(options: BenchOptions) -> int:
-    """Run the board; 2 where a command failed, 1 where something is worse than noise, else 0."""
+    """Run the board; return 2 if a command failed, 1 if a figure got worse, else 0."""
     from geogs_bench.board.board import board
     from geogs_bench.board.board_table import markdown
 

@@ -1,4 +1,4 @@
-"""Runs and scores the jobs of a benchmark; a job that fails takes nothing from the others."""
+"""Runs and scores the jobs of a benchmark; a job that fails does not affect the others."""
 
 import time
 import traceback
@@ -32,7 +32,7 @@ _ERROR_FILE = "bench_error.txt"
 
 
 class Harness:
-    """One benchmark into one folder; what was finished before is not run again."""
+    """Runs one benchmark into one folder; finished jobs are not run again."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class Harness:
         fresh: bool = False,
         rescore: bool = False,
     ) -> None:
-        """``fresh`` runs everything anew; ``rescore`` only scores it anew."""
+        """``fresh`` runs all jobs again; ``rescore`` only scores them again."""
         self._benchmark = benchmark
         self._output = output
         self._runner = runner
@@ -58,10 +58,10 @@ class Harness:
         jobs: Sequence[BenchmarkJob],
         report: Callable[[list[Record]], None] | None = None,
     ) -> list[Record]:
-        """All records of the benchmark, those of earlier calls in the same folder included.
+        """Run jobs; return all records of the benchmark, with those of earlier calls in the folder.
 
-        A job that fails leaves a record that says why, and the others go on. After each job
-        ``report`` is given all records; without one they become a report in the folder.
+        A job that fails leaves a record with the error, and the others go on. After each job
+        ``report`` receives all records; without one they become a report in the folder.
 
         Raises:
             InputError: an option does not exist or fit; found before anything is run.
@@ -88,7 +88,7 @@ class Harness:
         write_report(self._output, title, [Chapter(self._benchmark, records)])
 
     def records(self, jobs: Sequence[BenchmarkJob]) -> list[Record]:
-        """What the folder holds of this benchmark by now, in the order of the jobs."""
+        """Records of this benchmark in the folder, in the order of the jobs."""
         records = records_below(self._output, self._benchmark.name)
         scenes = [*self._benchmark.scenes, *(job.scene.name for job in jobs)]
         variants = [job.variant for job in jobs]
@@ -99,7 +99,7 @@ class Harness:
         return sorted(records, key=place)
 
     def _process(self, job: BenchmarkJob, settings: dict[str, object]) -> None:
-        """Run and score a job, as far as needed, and write its record."""
+        """Run and score a job, as far as necessary, and write its record."""
         folder = job.task.output
         digest = config_hash(job.task.command, settings)
         done = None if self._fresh else completed_run(folder, job.task.source, digest)
@@ -130,7 +130,7 @@ class Harness:
         write_json(folder / RECORD_FILE, record)
 
     def _run(self, job: BenchmarkJob, provenance: Provenance) -> CompletedRun:
-        """Run a job; its folder says so only once the run is complete."""
+        """Run a job; its folder is marked only once the run is complete."""
         folder = clear(job.task.output)
         forget_peak_memory()
         start = time.perf_counter()
@@ -138,7 +138,7 @@ class Harness:
         seconds = time.perf_counter() - start
         result = ResultFolder(folder)
         if result.summary.get("interrupted"):
-            raise KeyboardInterrupt  # the command has kept its part; the benchmark stops, too
+            raise KeyboardInterrupt  # the command has saved its state; the benchmark stops, too
         device = str(result.summary.get("device", "cpu"))
         provenance = replace(provenance, device=device)
         source = str(job.task.source.resolve())
@@ -150,7 +150,7 @@ class Harness:
 def score_given(
     benchmark: Benchmark, scene: BenchmarkScene, folder: Path, output: Path
 ) -> list[Record]:
-    """The record of a result that some earlier command left, with its report in ``output``.
+    """Score the result of an earlier command, with a report in ``output``; return its record.
 
     Raises:
         InputError: the result cannot be read or does not fit the scene.
@@ -171,7 +171,7 @@ def score_given(
 
 
 def cost_of(result: ResultFolder, seconds: float) -> Cost:
-    """What a run took, by its own summary; ``seconds`` are those of the whole command."""
+    """Cost of a run, by its own summary; ``seconds`` are those of the whole command."""
     summary = result.summary
     rates = summary.get("frames_per_second", {})
     return Cost(

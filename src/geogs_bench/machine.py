@@ -1,4 +1,4 @@
-"""What is measured on: the machine, and the state of the program."""
+"""The machine of a measurement, and the version of the program."""
 
 import ctypes
 import gc
@@ -18,7 +18,7 @@ def machine_name() -> str:
 
 
 def first_processor() -> dict[str, str]:
-    """What Linux says of the first processor, by the names in /proc/cpuinfo; elsewhere nothing."""
+    """Properties of the first processor, by the names in /proc/cpuinfo; empty without Linux."""
     said = dict[str, str]()
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
@@ -28,7 +28,7 @@ def first_processor() -> dict[str, str]:
 
 
 def program_version() -> str:
-    """The commit of the checkout that runs, ``+`` if changed since; else the version."""
+    """Commit of the running checkout, with ``+`` if files are changed; else the version."""
     package = PACKAGE.resolve()
     if _git(package.parent, "ls-files", "--error-unmatch", package.name) is None:
         return __version__  # installed, perhaps inside a repository of something else
@@ -38,10 +38,10 @@ def program_version() -> str:
 
 
 def forget_peak_memory() -> None:
-    """Start counting the largest memory use anew, so that each run reports its own.
+    """Reset the peak memory use, so that each run reports its own.
 
-    On systems that cannot do so, the figure is that of all runs of this process so far; and what
-    earlier runs left in memory counts everywhere.
+    On systems that cannot do so, the figure is that of all runs of this process so far; memory that
+    earlier runs still hold counts everywhere.
     """
     gc.collect()
     with suppress(OSError, AttributeError):  # the C library of Linux keeps freed memory otherwise
@@ -60,7 +60,7 @@ def _processor() -> str:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git says, or none where it fails or is missing."""
+    """Output of a git command; none if it fails or git is missing."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), *arguments],

@@ -12,23 +12,23 @@ from geogs_bench.runners.task import Command, Task
 
 @dataclass(frozen=True)
 class Selection:
-    """What of a benchmark is run, and how, by the user's choice."""
+    """The user's choice of the scenes, variants and options of a benchmark."""
 
     scenes: tuple[str, ...] = ()
-    """Only these, by name; those of the paper if none is named."""
+    """Names of the scenes; those of the paper if none is named."""
     variants: tuple[str, ...] = ()
-    """Only these; all if none is named."""
+    """Names of the variants; all if none is named."""
     options: tuple[Option, ...] = ()
-    """For every task; a variant's own options win over them."""
+    """Options of every task; a variant's own options win over them."""
     budgets: tuple[float, ...] = ()
-    """Seconds, for benchmarks from known poses; theirs if none is given."""
+    """Seconds of reconstructions from known poses; the benchmark's if none is given."""
     baseline: bool = False
-    """Whether the baseline with colour runs beside, from known poses."""
+    """Whether the baseline with colour runs too, from known poses."""
 
 
 @dataclass(frozen=True)
 class BenchmarkJob:
-    """One row of the results to be."""
+    """One future row of the results."""
 
     scene: BenchmarkScene
     variant: str
@@ -38,10 +38,10 @@ class BenchmarkJob:
 def find_scenes(
     benchmark: Benchmark, folder: Path, names: Sequence[str] = ()
 ) -> list[BenchmarkScene]:
-    """The scenes to run: those named, else the paper's, else all that are there.
+    """Find the scenes to run: those named, else the paper's, else all that are there.
 
     Raises:
-        InputError: there are none, or one that is named is missing.
+        InputError: there are none, or a named one is missing.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; {benchmark.name} needs {benchmark.needs}.")
@@ -59,10 +59,10 @@ def find_scenes(
 def make_jobs(
     benchmark: Benchmark, scenes: Sequence[BenchmarkScene], output: Path, selection: Selection
 ) -> list[BenchmarkJob]:
-    """One job for each scene and variant, scene by scene; what needs depth only where it is there.
+    """One job for each scene and variant, scene by scene; depth variants only with sensor depth.
 
     Raises:
-        InputError: a variant that is named does not exist, or can be run on none of the scenes.
+        InputError: a named variant does not exist, or can be run on none of the scenes.
     """
     variants = variants_of(benchmark, selection)
     known = [variant.name for variant in variants]

@@ -1,8 +1,8 @@
 """The figures printed in papers' tables, as constants; nothing here was measured by us.
 
-Unless a table says another source it is of the paper that the system follows.
+Unless a table names another source it is of the paper that the system follows.
 
-Rows are what the paper calls methods, columns are scenes (or variants, in the ablations). A star
+Rows are the paper's methods, columns are scenes (or variants, in the ablations). A star
 marks methods that the paper ran online, without their offline refinement of the map.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 PAPER = "GeoGS-SLAM"
-"""The method whose figures stand beside ours."""
+"""The method whose figures are shown beside ours."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class PublishedRow:
     metric: str
     values: tuple[float, ...]
     mean: float | None = None
-    """The printed mean; none where the table has none."""
+    """The printed mean; none if the table has none."""
 
 
 @dataclass(frozen=True)
@@ -34,17 +34,17 @@ class PublishedTable:
     columns: tuple[str, ...]
     rows: tuple[PublishedRow, ...]
     source: str = "the paper"
-    """Who printed it."""
+    """Publication that printed it."""
 
     def value(self, column: str, metric: str, method: str = PAPER) -> float | None:
-        """A printed figure, or none where the paper gives none."""
+        """A printed figure, or none if the paper gives none."""
         row = self._row(metric, method)
         if row is None or column not in self.columns:
             return None
         return row.values[self.columns.index(column)]
 
     def mean(self, columns: Iterable[str], metric: str, method: str = PAPER) -> float | None:
-        """The printed mean, or the mean over ``columns`` where these are only part of the table."""
+        """The printed mean, or the mean over ``columns`` if these are only part of the table."""
         row, kept = self._row(metric, method), set(columns)
         if row is None:
             return None
@@ -171,7 +171,7 @@ SCANNET = PublishedTable(
 )
 
 RGBD_METHODS = ("NICE-SLAM", "E-SLAM")
-"""Methods of the table of ScanNet that were given the depth of the sensor."""
+"""Methods of ScanNet's table that use the depth of the sensor."""
 
 TUM_RGBD = PublishedTable(
     "TUM-RGBD",

@@ -1,4 +1,4 @@
-"""Several benchmarks into one folder: on the user's data where it is there, else on stand-ins."""
+"""Several benchmarks into one folder: on the user's data if it is there, else on stand-ins."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from geogs_bench.tables.benchmark_report import Chapter, write_report
 
 @dataclass(frozen=True)
 class _Mark:
-    """Why the paper's figures do not stand beside ours."""
+    """Reason to leave out the paper's figures."""
 
     name: str
     """Ending of the benchmark's name, and so of its folder."""
@@ -40,10 +40,10 @@ _OTHER = _Mark(
 
 @dataclass(frozen=True)
 class SuitePart:
-    """A benchmark as a suite runs it here."""
+    """A benchmark of a suite with its jobs."""
 
     benchmark: Benchmark
-    """Marked, and without published figures, where its scenes are not the paper's."""
+    """Marked, and without published figures, if its scenes are not the paper's."""
     jobs: list[BenchmarkJob]
 
 
@@ -54,13 +54,13 @@ def suite_parts(
     selection: Selection,
     say: Callable[[str], None],
 ) -> list[SuitePart]:
-    """What is run for each table: the paper's scenes below ``data``, else others there, else
+    """Jobs of each table: on the paper's scenes below ``data``, else on others there, else on
     stand-ins, which are rendered below ``output``.
 
-    A table that has no scene or no variant of those that are asked for is left out.
+    A table without any of the chosen scenes or variants is left out.
 
     Raises:
-        InputError: no table has a scene or a variant that is asked for, or ``data`` is no folder.
+        InputError: no table has a chosen scene or variant, or ``data`` is no folder.
         OutputError: stand-ins cannot be written.
     """
     if data is not None and not data.is_dir():
@@ -94,21 +94,20 @@ def suite_parts(
 def _chosen(
     scenes: Sequence[BenchmarkScene], names: Sequence[str], papers: Sequence[str] = ()
 ) -> list[BenchmarkScene]:
-    """Those that are named, else the paper's, else all."""
+    """The named scenes, else the paper's, else all."""
     if names:
         return [scene for scene in scenes if scene.name in names]
     return [scene for scene in scenes if scene.name in papers] or list(scenes)
 
 
 def _for_scenes(benchmark: Benchmark, scenes: Sequence[BenchmarkScene]) -> Benchmark:
-    """Marked where papers printed something, and of none of the scenes."""
+    """The benchmark, marked if papers printed figures, but of none of the scenes."""
     is_papers = any(scene.name in benchmark.scenes for scene in scenes)
     return benchmark if is_papers or not benchmark.published else _marked(benchmark, _OTHER)
 
 
 def wanted_tables(suite: Suite, selection: Selection) -> list[tuple[SuiteTable, Selection]]:
-    """The tables that have a variant of those that are asked for, each with what of the choice
-    concerns it.
+    """The tables with a chosen variant, each with its part of the selection.
 
     Raises InputError if there are none.
     """
@@ -125,8 +124,7 @@ def run_parts(
     output: Path,
     harness: Callable[[Benchmark, Path], Harness],
 ) -> list[Chapter]:
-    """Run all parts in order, each in a folder of its own; the report of all is written after each
-    job.
+    """Run all parts in order, each in its own folder; write the report of all after each job.
 
     Raises:
         InputError: an option does not exist or fit; found before anything is run.
@@ -153,7 +151,7 @@ def _chapter(benchmark: Benchmark, records: Sequence[Record]) -> Chapter:
 
 
 def _selected(benchmark: Benchmark, selection: Selection) -> Selection | None:
-    """What of the user's choice concerns a benchmark; none where it has none of the variants."""
+    """The part of a selection that concerns a benchmark; none if it has none of the variants."""
     if not benchmark.budgets:
         selection = replace(selection, budgets=(), baseline=False)
     known = {variant.name for variant in variants_of(benchmark, selection)}
@@ -162,7 +160,7 @@ def _selected(benchmark: Benchmark, selection: Selection) -> Selection | None:
 
 
 def _scenes_below(data: Path | None, benchmark: Benchmark) -> list[BenchmarkScene]:
-    """All scenes in a folder or in its folders; of each name the first."""
+    """All scenes in a folder or in its subfolders; the first of each name."""
     if data is None:
         return []
     folders = [data, *sorted(path for path in data.iterdir() if path.is_dir())]
@@ -173,14 +171,14 @@ def _scenes_below(data: Path | None, benchmark: Benchmark) -> list[BenchmarkScen
 
 
 def _stand_ins(table: SuiteTable, folder: Path) -> list[BenchmarkScene]:
-    """Those of the table that have been rendered."""
+    """Stand-ins of the table that have been rendered."""
     names = {cell.name for cell in table.cells}
     found = table.find_stand_ins(folder) if folder.is_dir() else []
     return [scene for scene in found if scene.name in names]
 
 
 def _marked(benchmark: Benchmark, mark: _Mark) -> Benchmark:
-    """Says of which scenes it is, without the figures that are published of others."""
+    """Mark a benchmark with the kind of its scenes, and remove the published figures."""
     layouts = tuple(
         replace(layout, columns=tuple(replace(c, published=None) for c in layout.columns))
         for layout in benchmark.layouts

@@ -1,4 +1,4 @@
-"""Many sources on many machines, by Ray: each is a run of its own, which may move between them."""
+"""Many sources on many machines, by Ray: each is its own run, which may move between machines."""
 
 from geogs.cli.command import Command
 

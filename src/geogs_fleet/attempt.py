@@ -1,6 +1,6 @@
-"""One attempt at one source, on whichever node it falls: fetch, compute under watch, deliver.
+"""One attempt at one source on any node: fetch, compute under supervision, deliver.
 
-Nothing here loads PyTorch: the process that computes is another one.
+This file does not load PyTorch: another process computes.
 """
 
 import json
@@ -34,7 +34,7 @@ class FleetJob:
     output: str
     """Address of the folder of this source's results."""
     settings: RunSettings
-    """Without source and folder."""
+    """Settings of the run, without source and folder."""
     digest: str
     """Digest of the settings."""
     limits: Limits
@@ -44,9 +44,9 @@ class FleetJob:
 
 
 def attempt(job: FleetJob) -> Row:
-    """Compute a source, going on from its checkpoint if there is one; its row is stored last.
+    """Compute a source, from its checkpoint if there is one; its row is stored last.
 
-    Errors become a row that says them.
+    Errors become a row with their message.
     """
     begin = time.monotonic()
     state: State = "failed"
@@ -72,9 +72,9 @@ def attempt(job: FleetJob) -> Row:
 
 
 def _attempt(job: FleetJob) -> tuple[State, str, dict[str, Any]]:
-    """How it ended, why, and the summary of what there is."""
+    """Compute a source; return its state, the reason and the summary of its result."""
     place = StoragePath(job.output)
-    (place / FILE).delete()  # of a previous result, which is about to be replaced
+    (place / FILE).delete()  # row of a previous result, which is about to be replaced
     folder = WorkFolder(place)
     source = StoragePath(job.source.address).path or fetched(job.source, folder.scratch)
     settings = replace(job.settings, source=(source,), output=folder.path)
@@ -98,7 +98,7 @@ def _attempt(job: FleetJob) -> tuple[State, str, dict[str, Any]]:
 
 
 def judged(ending: ProcessEnd, limits: Limits, log: str) -> tuple[State, str]:
-    """Meaning of a process's ending: a state, and a sentence unless it is done."""
+    """State for the ending of a process, with a sentence unless it is done."""
     if ending.exceeded == "time":
         limit = duration(limits.seconds or 0)
         return "failed", f"It took longer than {limit}; with more --time-limit it goes on."

@@ -1,9 +1,9 @@
 """The process that computes one source: ``python -m geogs_fleet.child``, started by a node.
 
-Settings come as a pickle on the standard input, from the process that started this one; one line of
-JSON on the standard output says how it ended. Everything else goes to the standard error. When the
-standard input closes, who started this is gone, and it ends at once: another node goes on from the
-last checkpoint.
+The parent process sends the settings as a pickle on the standard input; one line of JSON on the
+standard output reports the outcome. Everything else goes to the standard error. When the standard
+input closes, the parent is gone, and this process ends at once: another node goes on from the last
+checkpoint.
 """
 
 import json
@@ -26,7 +26,7 @@ _PICTURES = ("keyframes.png", "trajectory.png")
 
 
 def main() -> int:
-    """Compute what the standard input says; 0 once the standard output says how it ended."""
+    """Compute by the settings on the standard input; return 0 once the outcome is reported."""
     said = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     settings: RunSettings = pickle.load(sys.stdin.buffer)
@@ -34,7 +34,7 @@ def main() -> int:
     try:
         compute(settings)
         ending = {"state": "done", "sentence": ""}
-    except DeviceError as error:  # another GPU may do
+    except DeviceError as error:  # another GPU may work
         ending = {"state": "crashed", "sentence": str(error)}
     except GeogsError as error:
         ending = {"state": "failed", "sentence": str(error)}
@@ -44,7 +44,7 @@ def main() -> int:
 
 
 def compute(settings: RunSettings) -> None:
-    """Run, or go on from the checkpoint in the folder if it is one of the same work.
+    """Run, or go on from the checkpoint in the folder if it has the same settings.
 
     Raises:
         InputError, TrackingLost, OutputError, DeviceError: as of a run.
@@ -59,7 +59,7 @@ def compute(settings: RunSettings) -> None:
         if _is_begun(output, settings):
             try:
                 resume(output, settings, progress)
-            except InputError as error:  # the source has changed, say
+            except InputError as error:  # for example, the source has changed
                 progress.write(f"Starting anew: {error}")
                 run(settings, progress)
         else:
@@ -68,7 +68,7 @@ def compute(settings: RunSettings) -> None:
 
 
 def write_thumbnail(output: Path) -> None:
-    """A small picture of the result, if its report has any. Raises OutputError."""
+    """Write a small picture of the result, if its report has any. Raises OutputError."""
     import cv2
     from PIL import Image
 
@@ -103,7 +103,7 @@ def _is_begun(output: Path, settings: RunSettings) -> bool:
 
 
 def _wait_for_others(output: Path) -> None:
-    """Until an attempt that is about to end has left the folder; OutputError if none does."""
+    """Wait until an attempt that is about to end has left the folder. Raises OutputError if not."""
     from geogs.application.results.output_folder import only_writer
     from geogs.io.writers.atomic import prepare_output_folder
 

@@ -1,4 +1,4 @@
-"""``geogs fleet run`` and ``geogs fleet join``: many videos, one by one or to one place, on Ray."""
+"""``geogs fleet run`` and ``geogs fleet join``: many videos, each alone or joined, on Ray."""
 
 import time
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 
 Options = TypeVar("Options", bound=FleetOptions)
 EXIT_FAILED = 1
-"""Exit code where all has been tried, and a source failed."""
+"""Exit code if all sources were tried, and one failed."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns 0, or 1 where a source failed or a part could not be joined."""
+    """Run the command; return 0, or 1 if a source failed or a part could not be joined."""
     words = list(argv)
     if words and words[0] == "join":
         return _join(words[1:])
@@ -53,7 +53,7 @@ def _join(words: Sequence[str]) -> int:
 
 
 def parse(argv: Sequence[str]) -> FleetOptions:
-    """Options over those of a preset.
+    """Parse options, over those of a preset.
 
     Raises:
         SystemExit: after ``--help``.

@@ -1,4 +1,4 @@
-"""Ray: found or started, and what one source gets of it."""
+"""A cluster of Ray, found or started, and the resources of one source."""
 
 import os
 import platform
@@ -15,11 +15,11 @@ from geogs_fleet.fleet_options import FleetOptions
 _OBJECTS = 80 << 20
 """Bytes of the object store of a local cluster; rows are small."""
 ASKS_FOR_TOKEN = 2, 59
-"""Ray from which on a cluster that is started here asks for a token; its ports are open to the
-network, whatever address it is given."""
+"""First version of Ray with which a cluster started here requires a token; its ports are open to
+the network, whatever its address."""
 _PASSING = "geogs: ends with its command"
-"""Resource of a cluster that ends with its command, so that no other command on this machine uses
-it."""
+"""Resource that marks a cluster that ends with its command, so that no other command on this
+machine uses it."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +29,16 @@ class Allocation:
     cpus: int
     gpus: float
     memory: int | None = None
-    """Bytes, that tasks are placed by."""
+    """Memory by which Ray schedules tasks, bytes."""
     at_once: int = 1
-    """How many sources the cluster can take at a time, as it is now."""
+    """Number of sources that the cluster, as it is now, can compute at a time."""
 
 
 @contextmanager
 def ray_cluster(address: str) -> Iterator[Any]:
-    """Inside, Ray is there: a cluster that runs, or one started here and ended afterwards.
+    """Context with a connection to a running cluster, or to one started here and ended afterwards.
 
-    Yields the module ``ray``. A connection that there is already is used, and kept.
+    Yields the module ``ray``. An existing connection is used, and kept.
 
     Raises:
         InputError: Ray is not installed, or the cluster cannot be reached.
@@ -60,10 +60,10 @@ def ray_cluster(address: str) -> Iterator[Any]:
 
 
 def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
-    """Allocation of each source, where settings leave it open.
+    """Allocation of each source; the settings that are open are chosen by the nodes.
 
     Raises:
-        InputError: no node has as much as is asked for.
+        InputError: no node has the requested resources.
     """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     most_gpus = max((node.get("GPU", 0.0) for node in nodes), default=0.0)
@@ -91,10 +91,10 @@ def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
 def as_task(
     ray: Any, function: Callable[..., Any], allocation: Allocation, retries: int = 0
 ) -> Callable[..., Any]:
-    """A function as a task of Ray that gets so much of a node; called, it gives Ray's reference.
+    """Make a function a task of Ray with these resources; a call returns Ray's reference.
 
-    Ray calls it again, up to so many times, where its node or its process is lost. A node with
-    another version of geogs refuses: the task raises InputError.
+    Ray repeats it up to ``retries`` times if its node or its process is lost. A node with another
+    version of geogs refuses: the task raises InputError.
     """
     checked = ray.remote(in_version).options(
         num_cpus=allocation.cpus,
@@ -107,7 +107,7 @@ def as_task(
 
 
 def in_version(version: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function; raises InputError where another version of geogs is installed."""
+    """Call a function. Raises InputError if another version of geogs is installed."""
     if __version__ != version:
         raise InputError(
             f"The machine {platform.node()} has geogs {__version__}, and the fleet is of "
@@ -117,7 +117,7 @@ def in_version(version: str, function: Callable[..., Any], *arguments: Any) -> A
 
 
 def _times(node: dict[str, float], wanted: dict[str, float]) -> int:
-    """How many times a node has what is wanted."""
+    """Number of times that a node has the wanted resources."""
     return min(
         int(node.get(name, 0.0) / amount + 1e-9) for name, amount in wanted.items() if amount
     )

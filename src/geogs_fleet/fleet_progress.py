@@ -1,4 +1,4 @@
-"""How a fleet tells how far it is and how long the rest will take."""
+"""Progress of a fleet, and its estimated remaining time."""
 
 import time
 from collections.abc import Callable
@@ -7,17 +7,17 @@ from geogs_fleet.row import Row
 
 
 class FleetProgress:
-    """Follows a fleet from outside; this one shows nothing. Override what you want to see."""
+    """Receives the progress of a fleet; this one shows nothing. Override what you want to see."""
 
     def begin(self, sources: int, done_before: int, at_once: int) -> None:
-        """Before the first source; so many can be computed at a time."""
+        """Called before the first source; ``at_once`` sources can be computed at a time."""
 
     def ended(self, row: Row, left: int, seconds_left: float) -> None:
-        """After each source; so many are left, for about so long."""
+        """Called after each source; ``left`` sources remain, for about ``seconds_left``."""
 
 
 class Pace:
-    """How long the sources that are left will take, from those that have ended."""
+    """Estimate of the remaining time, from the sources that have ended."""
 
     def __init__(
         self, sources: int, at_once: int, clock: Callable[[], float] = time.monotonic
@@ -29,10 +29,10 @@ class Pace:
         self._ended = 0
 
     def after_one(self, seconds: float) -> tuple[int, float]:
-        """Sources left, and seconds left, after one that took so long.
+        """Sources left, and seconds left, after a source that took ``seconds``.
 
-        The mean time between two ends so far; until there were as many as are computed at a time,
-        this source's time over their number.
+        It uses the mean time between two ends so far; until ``at_once`` sources have ended, at most
+        this source's time over the number of concurrent ones.
         """
         self._ended += 1
         self._left -= 1

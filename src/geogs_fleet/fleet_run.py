@@ -1,4 +1,4 @@
-"""A fleet, from the words that name its sources to its table."""
+"""A fleet, from the names of its sources to its table."""
 
 import time
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from geogs_fleet.supervise import Limits
 from geogs_fleet.table import write_table
 
 _BETWEEN_TABLES = 5.0
-"""Seconds between two writings of the table, at least."""
+"""Least time between two writings of the table, seconds."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class FleetResult:
     rows: list[Row]
     """Rows of all sources, in their order."""
     computed: int
-    """How many were computed this time; the others were done before."""
+    """Number of sources computed this time; the others were done before."""
 
 
 def run_fleet(
@@ -43,11 +43,11 @@ def run_fleet(
 ) -> FleetResult:
     """Compute every source that is not done yet, each into a folder of its name.
 
-    A source that fails has a row that says why. ``command`` is the program that computes one
+    A source that fails has a row with the reason. ``command`` is the program that computes one
     source, see :mod:`geogs_fleet.child`.
 
     Raises:
-        InputError: no source is found, Ray is missing, or no machine has what is asked for.
+        InputError: no source is found, Ray is missing, or no machine has the requested resources.
         OutputError: the table cannot be written, or another fleet writes there.
         KeyboardInterrupt: after Ctrl-C; the table has been written.
     """
@@ -114,7 +114,7 @@ def _run_settings(settings: FleetOptions, device: str) -> RunSettings:
 
 
 def _digest(settings: RunSettings) -> str:
-    """Digest of what decides about a result; where it is computed does not."""
+    """Digest of the settings that determine a result; the checkpoints' interval does not."""
     deciding = replace(settings, checkpoint_every=60.0)
     return sha256(repr(deciding).encode()).hexdigest()[:16]
 
@@ -133,6 +133,6 @@ def _write(
 
 
 def _alone(output: StoragePath) -> AbstractContextManager[None]:
-    """One fleet at a time in a folder, where that can have locks."""
+    """Lock a folder for this fleet, if it can have locks."""
     path = output.path
     return nullcontext() if path is None else only_writer(prepare_output_folder(path))

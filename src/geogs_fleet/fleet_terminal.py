@@ -1,4 +1,4 @@
-"""A fleet on the terminal: a line for each source that ends, and how long the rest will take."""
+"""A fleet on the terminal: a line for each source that ends, with the remaining time."""
 
 from rich.console import Console
 
@@ -8,20 +8,20 @@ from geogs_fleet.row import Row
 
 
 class TerminalFleet(FleetProgress):
-    """Writes to the standard error, or nothing where it is quiet."""
+    """Writes to the standard error, or nothing if it is quiet."""
 
     def __init__(self, quiet: bool = False) -> None:
         self._console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
         self._sources = 0
 
     def begin(self, sources: int, done_before: int, at_once: int) -> None:
-        """Say how many there are."""
+        """Print the number of sources."""
         self._sources = sources
         before = f", {done_before} of them done before" if done_before else ""
         self._console.print(f"{_sources(sources)}{before}; {at_once} at a time.", markup=False)
 
     def ended(self, row: Row, left: int, seconds_left: float) -> None:
-        """Say how it ended."""
+        """Print the outcome of a source."""
         done = self._sources - left
         rest = f"; about {duration(seconds_left)} left" if left else ""
         how = "" if row.state == "done" else "failed: "
@@ -29,7 +29,7 @@ class TerminalFleet(FleetProgress):
         self._console.print(f"{head}: {how}{row.sentence}", markup=False)
 
     def say(self, sentence: str) -> None:
-        """Say anything else."""
+        """Print any other sentence."""
         self._console.print(sentence, markup=False)
 
 

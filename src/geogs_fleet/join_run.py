@@ -1,4 +1,4 @@
-"""``geogs fleet join``: parts of one place, run where they are not yet, then joined."""
+"""``geogs fleet join``: runs the overlapping parts that have no result yet, then joins all."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from geogs_fleet.join.part import Part
 
 PARTS = "parts"
-"""Folder for the results of parts that had to be run."""
+"""Folder for the results of parts that are run."""
 
 
 def run_join(
@@ -33,7 +33,7 @@ def run_join(
     """Run the parts that are no results yet, and join all of them.
 
     Raises:
-        InputError: a part is none, no two of them show one place, or Ray is missing.
+        InputError: a part is unusable, no two of them overlap, or Ray is missing.
         OutputError: the result cannot be written.
     """
     path = StoragePath(settings.output).path if settings.output else None
@@ -56,7 +56,7 @@ def _parts(
     progress: FleetProgress | None,
     say: Callable[[str], None],
 ) -> "list[Part]":
-    """The results to be joined, in the order in which they were named."""
+    """The results to join, in the order of their names on the command line."""
     from geogs_fleet.join.part import Part
 
     found: list[Path | str] = []
@@ -84,7 +84,7 @@ def _parts(
 
 
 def finished_results(word: str) -> list[Path]:
-    """Folders of the results that a word names: one, or those of a fleet; none if it is neither."""
+    """Folders of the results that a word names: a result, or those of a fleet; else none."""
     path = StoragePath(word).path
     if path is None or not path.is_dir():
         return []
@@ -102,7 +102,7 @@ def finished_results(word: str) -> list[Path]:
 
 
 def _names(folders: list[Path]) -> list[str]:
-    """A name for each that no other has."""
+    """A unique name for each folder."""
     names: list[str] = []
     for folder in folders:
         same = sum(name == folder.name or name.startswith(f"{folder.name}-") for name in names)

@@ -1,6 +1,6 @@
-"""The jobs of a fleet through Ray, and again where a machine or a process failed.
+"""The jobs of a fleet through Ray, repeated if a machine or a process fails.
 
-The number of an attempt stands in its row and is not known to Ray's own retries.
+The number of an attempt is stored in its row; Ray's own retries do not know it.
 """
 
 from collections.abc import Generator, Iterable
@@ -14,16 +14,16 @@ from geogs_fleet.cluster import Allocation, as_task
 from geogs_fleet.row import Row
 
 _LOOK = 0.5
-"""Seconds between two looks at what has ended, while some jobs are out."""
+"""Seconds between two checks for jobs that have ended."""
 
 
 def rows_of(
     ray: Any, jobs: Iterable[FleetJob], allocation: Allocation, attempts: int
 ) -> Generator[Row, None, None]:
-    """The row of every job, in the order in which they end; each job has exactly one.
+    """Yield the row of every job, in the order in which they end; each job has exactly one.
 
-    All jobs are handed to Ray at once. One whose node or process fails is handed in again, up to
-    ``attempts`` times in all. When the caller stops listening, what is out is ended.
+    All jobs are submitted to Ray at once. A job whose node or process fails is submitted again, up
+    to ``attempts`` times in all. When the caller stops iterating, the remaining jobs are cancelled.
     """
     task = as_task(ray, attempt, allocation)
     out: dict[Any, FleetJob] = {task(job): job for job in jobs}
@@ -40,12 +40,12 @@ def rows_of(
                     yield replace(row, state="failed") if row.state == "crashed" else row
     finally:
         for reference in out:
-            with suppress(Exception):  # also while the cluster goes away
+            with suppress(Exception):  # also while the cluster shuts down
                 ray.cancel(reference, force=True)
 
 
 def _row(ray: Any, reference: Any, job: FleetJob) -> Row:
-    """The row that came back; a crash where Ray lost the task."""
+    """The row of a task, or that of a crash if Ray lost the task."""
     try:
         row: Row = ray.get(reference)
         return row

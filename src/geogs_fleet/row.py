@@ -9,27 +9,27 @@ from typing import Any, Literal, get_args
 from geogs.documents import UNUSABLE
 
 State = Literal["done", "failed", "crashed"]
-"""crashed is worth another attempt: the machine or the process ended, not the work."""
+"""A crashed source is tried again: the machine or the process ended, not the work."""
 FILE = "source.json"
-"""Name of a row in the folder of its source; it is there once the source is done."""
+"""File of a row in the folder of its source; written once the source is done."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A source, and how it ended."""
+    """A source and its outcome."""
 
     name: str
     source: str
     """Its address."""
     state: State
     sentence: str
-    """The verdict, or what went wrong."""
+    """The verdict, or the reason of the failure."""
     settings: str
-    """Digest of the settings it was computed with."""
+    """Digest of its settings."""
     is_reliable: bool | None = None
-    """The verdict; none where nothing was judged."""
+    """The verdict; none if nothing was judged."""
     seconds: float = 0.0
-    """How long the attempt took that ended it."""
+    """Duration of the last attempt."""
     attempts: int = 1
     node: str = ""
     """Name of the machine of that attempt."""
@@ -38,7 +38,7 @@ class Row:
 
     @property
     def trouble(self) -> tuple[int, float]:
-        """Higher comes first in the table: failed, not reliable, much of it lost."""
+        """Key of the table's order, highest first: failed, not reliable, much of it lost."""
         rank = 3 if self.state != "done" else {False: 2, None: 1, True: 0}[self.is_reliable]
         return rank, self.numbers.get("lost", 0.0)
 
@@ -49,7 +49,7 @@ def row_text(row: Row) -> str:
 
 
 def read_row(text: str | None) -> Row | None:
-    """The row of a text that ``row_text`` made; none if there is none, or it is damaged."""
+    """Parse the text of ``row_text``; none if there is none, or it is damaged."""
     try:
         given = json.loads(text or "")
         row = Row(**{f.name: given[f.name] for f in fields(Row)})
@@ -59,7 +59,7 @@ def read_row(text: str | None) -> Row | None:
 
 
 def _is_sound(row: Row) -> bool:
-    """Whether everything in a row that was read is of the kind that it should be."""
+    """Whether all values of a row that was read are of the right types."""
     words = (row.name, row.source, row.sentence, row.settings, row.node)
     numbers = (row.seconds, row.attempts, *row.numbers.values())
     return (

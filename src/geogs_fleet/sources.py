@@ -1,4 +1,4 @@
-"""From what the user names to the list of sources, each with a name of its own."""
+"""List of sources, each with a unique name, from the user's words."""
 
 import hashlib
 import re
@@ -14,9 +14,9 @@ VIDEOS = frozenset({
     ".3gp", ".avi", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
     ".webm", ".wmv",
 })  # fmt: skip
-"""Endings by which a video in a folder is known; one that is named itself may have any."""
+"""Endings by which videos in a folder are recognised; a video named itself may have any."""
 _TABLES = frozenset({"rgb.txt", "traj.txt"})
-"""Files of a data set, which is one source whatever else lies in it."""
+"""Files of a data set, which is one source whatever else it contains."""
 _PATTERN = re.compile(r"[*?\[]")
 
 
@@ -25,17 +25,17 @@ class FleetSource:
     """One video or folder of images."""
 
     address: str
-    """An absolute path, or an address that fsspec knows."""
+    """An absolute path, or an address for fsspec."""
     name: str
-    """Name of its folder in the results; no other source of the fleet has it."""
+    """Name of its folder in the results, unique in the fleet."""
 
 
 def find_sources(given: Sequence[str]) -> list[FleetSource]:
-    """Sources that some words name, each once, in the order given.
+    """Find the sources that words name, each once, in the given order.
 
     A word is a text file (.txt) with one address a line (empty lines and those that begin with #
-    say nothing; paths are relative to the file), a pattern, a folder with videos and folders of
-    images in it, or a source itself: a video, or a folder with no such thing in it.
+    are ignored; paths are relative to the file), a pattern, a folder of videos and of folders of
+    images, or a source itself: a video, or any other folder.
 
     Raises:
         InputError: a word names nothing, or a list cannot be read.
@@ -44,7 +44,7 @@ def find_sources(given: Sequence[str]) -> list[FleetSource]:
     if not addresses:
         raise InputError("No source was found; give videos, folders, a pattern or a list (.txt).")
     stems = [_stem(address) for address in addresses]
-    often = Counter(stem.lower() for stem in stems)  # some disks take a and A for one
+    often = Counter(stem.lower() for stem in stems)  # some file systems do not tell a from A
     return [
         FleetSource(address, stem if often[stem.lower()] == 1 else f"{stem}-{_digest(address)}")
         for address, stem in zip(addresses, stems, strict=True)
@@ -80,7 +80,7 @@ def _lines(place: StoragePath, folder: Path | None) -> Iterator[str]:
 
 
 def _inside(place: StoragePath) -> list[str]:
-    """Sources in a folder; nothing if it is a source itself."""
+    """Sources in a folder; empty if it is a source itself."""
     listed = {name: kind for name, kind in place.listed().items() if not name.startswith(".")}
     videos = [n for n, is_folder in listed.items() if not is_folder and _suffix(n) in VIDEOS]
     folders = [name for name, is_folder in listed.items() if is_folder]

@@ -1,4 +1,4 @@
-"""Files and folders by their address: a path of this machine, or whatever fsspec can reach."""
+"""Files and folders by their address: a path of this machine, or any address of fsspec."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,7 +10,7 @@ from geogs.errors import GeogsError, InputError, OutputError
 from geogs.io.writers.atomic import write_text
 
 PATIENCE = 60.0
-"""Seconds that a server may be silent, however long a file takes."""
+"""Seconds that a server may be silent; the whole transfer may take longer."""
 
 
 class StoragePath:
@@ -24,12 +24,12 @@ class StoragePath:
 
     @property
     def path(self) -> Path | None:
-        """Where it lies on this machine; none if it does not."""
+        """Its path on this machine; none if it is elsewhere."""
         address = self.address.removeprefix("file://")
         return None if "://" in address else expanded(address)
 
     def absolute(self) -> "StoragePath":
-        """The same place by an absolute path, if it lies on this machine."""
+        """The same address as an absolute path, if it is on this machine."""
         return self if self.path is None else StoragePath(str(self.path.absolute()))
 
     @property
@@ -51,7 +51,7 @@ class StoragePath:
         return None
 
     def write(self, text: str) -> None:
-        """Make a text file in UTF-8, completely or not at all.
+        """Write a text file in UTF-8, completely or not at all.
 
         Raises:
             OutputError: it cannot be written.
@@ -72,7 +72,7 @@ class StoragePath:
                 system.rm_file(path)
 
     def listed(self) -> dict[str, bool]:
-        """Names in a folder, and whether each is a folder; nothing if this is no folder.
+        """Names in a folder, and whether each is a folder; empty if this is no folder.
 
         Raises:
             InputError: it cannot be read.
@@ -90,7 +90,7 @@ class StoragePath:
         return {}
 
     def matching(self) -> list[str]:
-        """Addresses that fit a pattern, in their order; the address is the pattern."""
+        """Sorted addresses that match a pattern; the address is the pattern."""
         import glob
 
         if self.path is not None:
@@ -99,10 +99,10 @@ class StoragePath:
             return sorted(system.unstrip_protocol(found) for found in system.glob(path))
 
     def download(self, target: Path) -> None:
-        """Copy the file, or all in the folder, to a path of this machine.
+        """Copy the file, or the folder's content, to a path of this machine.
 
         Raises:
-            InputError: it is not there, or cannot be read.
+            InputError: it does not exist, or cannot be read.
         """
         with self._failing(InputError, "read"), self._reached() as (system, path):
             if system.isfile(path):
@@ -128,7 +128,7 @@ class StoragePath:
 
     @contextmanager
     def _failing(self, kind: type[GeogsError], done: str) -> Iterator[None]:
-        """Says of a failure inside that this cannot be read, written or deleted."""
+        """Turn a failure inside into the error that this cannot be read, written or deleted."""
         try:
             yield
         except (OSError, UnicodeDecodeError) as error:
@@ -138,7 +138,7 @@ class StoragePath:
     def _reached(self) -> Iterator[tuple[Any, str]]:
         """The file system and the path in it. Raises InputError if there is none of that kind.
 
-        What a file system raises of its own kind leaves as an OSError.
+        Errors of the file system's own types become an OSError.
         """
         try:
             from fsspec.core import url_to_fs
@@ -157,7 +157,7 @@ class StoragePath:
 
 
 def _limits(address: str) -> dict[str, Any]:
-    """Options by which a file system waits no longer than ``PATIENCE`` for a silent server."""
+    """Options with which a file system waits at most ``PATIENCE`` for a silent server."""
     protocol = address.partition("://")[0]
     if protocol in ("http", "https"):
         from aiohttp import ClientTimeout

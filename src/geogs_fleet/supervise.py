@@ -1,4 +1,4 @@
-"""A process under watch: ended when it takes too long or too much."""
+"""A supervised process: killed when it exceeds its time or memory."""
 
 import os
 import subprocess
@@ -11,12 +11,12 @@ from tempfile import TemporaryFile
 from typing import Literal
 
 _LOOK = 0.5
-"""Seconds between two looks at what the process takes."""
+"""Seconds between two checks of the process."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a process; none lets it take what it needs."""
+    """Limits of a process; none for no limit."""
 
     seconds: float | None = None
     memory: int | None = None
@@ -25,12 +25,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class ProcessEnd:
-    """How a process ended."""
+    """Outcome of a process."""
 
     code: int
-    """Negative for the signal that killed it."""
+    """Exit code; negative for the signal that killed it."""
     said: str
-    """On its standard output."""
+    """Text on its standard output."""
     exceeded: Literal["", "time", "memory"] = ""
 
 
@@ -42,12 +42,12 @@ def supervise(
     environment: Mapping[str, str],
     meanwhile: Callable[[], None],
 ) -> ProcessEnd:
-    """Run a command until it ends, or has to.
+    """Run a command until it ends or exceeds a limit.
 
     Args:
         command: program and arguments.
-        message: what its standard input holds, which stays open for as long as we live.
-        log: file to which its standard error is added.
+        message: content of its standard input, which stays open as long as this process lives.
+        log: file to which its standard error is appended.
         limits: it is killed when it exceeds them.
         environment: its environment variables.
         meanwhile: called about twice a second.
@@ -60,7 +60,7 @@ def supervise(
         )
         assert process.stdin is not None
         try:
-            with suppress(BrokenPipeError):  # it has ended already, and how is asked later
+            with suppress(BrokenPipeError):  # it has ended already; its exit code is read later
                 process.stdin.write(message)
                 process.stdin.flush()
             while process.poll() is None:
@@ -82,7 +82,7 @@ def supervise(
 
 
 def resident(process: int) -> int:
-    """Bytes of memory that a process uses now; 0 where the system does not tell."""
+    """Bytes of memory that a process uses now; 0 if the system does not report it."""
     try:
         pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):

@@ -1,4 +1,4 @@
-"""``fleet.json`` and the page of a fleet: a row for every source, those with trouble first."""
+"""``fleet.json`` and the page of a fleet: a row for every source, failures first."""
 
 import html
 import json
@@ -28,8 +28,8 @@ def write_table(output: StoragePath, rows: Sequence[Row], waiting: int, seconds:
     Args:
         output: the folder.
         rows: of the sources that have ended, now or before.
-        waiting: how many have not.
-        seconds: how long the fleet has worked, this time.
+        waiting: number of sources that have not.
+        seconds: duration of this call so far.
 
     Raises:
         OutputError: they cannot be written.

@@ -1,8 +1,8 @@
-"""Where a run works on its node, and how what it writes gets to where it belongs.
+"""Working folder of a run on its node, and the transfer of its files to the output.
 
-Results that lie on a path are worked on there. Where they are elsewhere, the run works in a folder
-for temporary files, and every new checkpoint and the results are copied; a checkpoint's manifest
-goes last, so that one which was cut off is known as damaged.
+With an output on a local path, the run works there. Otherwise it works in a temporary folder, and
+every new checkpoint and the results are copied; a checkpoint's manifest is copied last, so that an
+incomplete one is recognised as damaged.
 """
 
 import os
@@ -20,12 +20,12 @@ _MANIFEST = "manifest.json"  # of geogs.application.checkpoints.folder, which lo
 
 
 class WorkFolder:
-    """The folder of one source's results, as a run on this node sees it."""
+    """The folder of one source's results for a run on this node."""
 
     def __init__(self, place: StoragePath) -> None:
         self._place = place
         mark = sha256(place.address.encode("utf-8", "backslashreplace")).hexdigest()[:16]
-        # The same path on every node: a checkpoint holds that of its source.
+        # The same path on every node: a checkpoint stores the path of its source.
         self.scratch = Path(tempfile.gettempdir()) / f"geogs-fleet-{os.getuid()}" / mark
         self.path = place.path or self.scratch / "result"
         self._kept: tuple[int, int] | None = None
@@ -38,7 +38,7 @@ class WorkFolder:
             self._take_checkpoint()
 
     def keep_checkpoint(self) -> None:
-        """Copy the checkpoint, if it is a new one."""
+        """Copy the checkpoint to the output, if it is new."""
         manifest = self.path / "checkpoint" / _MANIFEST
         if self._place.path is not None:
             return
@@ -55,13 +55,13 @@ class WorkFolder:
             return
 
     def keep(self, files: list[Path]) -> None:
-        """Copy files of the folder. Raises OutputError if they cannot be."""
+        """Copy files of the folder to the output. Raises OutputError if that fails."""
         if self._place.path is None:
             for path in files:
                 (self._place / path.relative_to(self.path).as_posix()).upload(path)
 
     def leave(self) -> None:
-        """After success: what was for the time of work only."""
+        """Remove temporary files and checkpoints after success."""
         if self._place.path is None:
             previous = self._place / "checkpoint"
             for name in previous.listed():
@@ -77,7 +77,7 @@ class WorkFolder:
 
 
 def fetched(source: FleetSource, scratch: Path) -> Path:
-    """A copy of a source that is elsewhere. Raises InputError if it cannot be had."""
+    """Download a source from elsewhere. Raises InputError if that fails."""
     place = StoragePath(source.address)
     target = scratch / "source" / (place.name or "source")
     if not target.exists():

@@ -1,4 +1,4 @@
-"""Who does the jobs of a join: the tasks of a Ray cluster."""
+"""Workers for the jobs of a join: tasks of a Ray cluster."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,23 +14,23 @@ R = TypeVar("R")
 
 @runtime_checkable
 class Workers(Protocol):
-    """Does jobs that do not depend on each other."""
+    """Runs independent jobs."""
 
     @property
     def at_once(self) -> int:
-        """How many jobs can be done at a time."""
+        """Number of jobs that can run at a time."""
         ...
 
     def map(self, stage: str, function: Callable[[*Ts], R], jobs: Sequence[tuple[*Ts]]) -> list[R]:
-        """``function(*job)`` of every job, in their order; each counts once, however often done.
+        """``function(*job)`` of every job, in their order; one result a job, however often tried.
 
-        ``stage`` names the work for who follows it. Raises what ``function`` raises.
+        ``stage`` names the work in progress reports. Raises the errors of ``function``.
         """
         ...
 
 
 class RayWorkers:
-    """Does jobs on a cluster, again where a node or a process is lost."""
+    """Runs jobs on a cluster, and repeats them if a node or a process is lost."""
 
     def __init__(
         self,
@@ -39,16 +39,16 @@ class RayWorkers:
         attempts: int,
         say: Callable[[str], None] = lambda sentence: None,
     ) -> None:
-        """``allocation``: what each job gets of a node; ``say`` is given a line for every stage."""
+        """``allocation``: resources of each job; ``say`` receives a line for every stage."""
         self._ray, self._allocation, self._attempts, self._say = ray, allocation, attempts, say
 
     @property
     def at_once(self) -> int:
-        """How many jobs can be done at a time."""
+        """Number of jobs that can run at a time."""
         return self._allocation.at_once
 
     def map(self, stage: str, function: Callable[[*Ts], R], jobs: Sequence[tuple[*Ts]]) -> list[R]:
-        """As in the protocol.
+        """Implements the protocol.
 
         Raises:
             GeogsError: as ``function`` raises it, or a job failed as often as it was tried.
@@ -70,7 +70,7 @@ class RayWorkers:
 
 
 def _results(ray: Any, references: Sequence[Any]) -> Any:
-    """The results of all tasks; after an error or Ctrl-C what is still under way is ended."""
+    """The results of all tasks; after an error or Ctrl-C the remaining tasks are cancelled."""
     try:
         return ray.get(references)
     except BaseException:

@@ -1,4 +1,4 @@
-"""Frames of a video without a place, by structure from motion about others that have one."""
+"""Poses of lost frames of a video, by structure from motion around frames with a pose."""
 
 import tempfile
 from collections.abc import Sequence
@@ -59,12 +59,12 @@ def place_lost(
 def deviations_by_part(
     model: Any, images: Sequence[Any], is_known: Bool[np.ndarray, "n"]
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Standard deviations of the pictures' centres (world units) and orientations (radians) beside
-    the known ones nearest to each; infinite where no two of them are joined to it, as one tells no
-    scale.
+    """Standard deviations of the pictures' centres (world units) and orientations (radians),
+    relative to the nearest known pictures; infinite if fewer than two of these are in its part, as
+    one does not determine the scale.
 
-    Known ones at either end of a stretch, whose matches do not join them, are parts of their own:
-    how these lie to each other is not for matches to tell.
+    Known pictures at either end of a gap that matches do not bridge are separate parts: matches do
+    not determine the relative pose of these.
     """
     position, rotation = np.full((2, len(images)), np.inf)
     for part in parts_of_one_scale(model, [image.image_id for image in images]):

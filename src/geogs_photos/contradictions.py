@@ -1,10 +1,10 @@
-"""The part of a reconstruction that is left where matches contradict the poses of its pictures.
+"""Removes the parts of a reconstruction whose poses the matches contradict.
 
-A wrong world need not lie off the epipolar lines: two parts that are joined with a wrong turn let
-all matches between them lie near a circle through both cameras (a horopter), where any turn does.
-But where a turn alone explains the matches in both coordinates, hardly another one can be true.
-And of a building whose sides look alike, more frames may match falsely than are joined in truth
-(Heinly et al. 2014); but frames that follow one another show the same side.
+The epipolar error alone does not reveal a wrong world: if two parts are joined with a wrong
+rotation, all matches between them can lie near a circle through both cameras (a horopter), where
+any rotation fits. But if a rotation alone explains the matches in both coordinates, hardly another
+one can be true. If the sides of a building look alike, false matches can outnumber true ones
+(Heinly et al. 2014); but consecutive frames show the same side.
 """
 
 from collections.abc import Container, Iterable, Sequence
@@ -24,44 +24,44 @@ from geogs_photos.photo_pairs import FOLLOWING
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
 LEAST_EXPLAINED = 0.5
-"""Fraction of a pair's matches that has to be explained, by the poses or by a rotation alone."""
+"""Least fraction of a pair's matches that the poses, or a rotation alone, have to explain."""
 MAX_ROTATION_DISAGREEMENT_DEG = 20.0
-"""Most between the rotation of two poses and one that explains their matches by itself: more than a
-step to the side makes of a scene that is equally far everywhere."""
+"""Largest angle between the rotation of two poses and one that alone explains their matches: more
+than a sideways step in front of a scene of constant depth causes."""
 FOLLOWING_WEIGHT = 200
-"""Times that matches of frames that follow one another count; those that speak for the poses twice
-that, as few false ones are among many true ones anywhere (docs/notebook/photographs.md)."""
+"""Weight of the matches of consecutive frames; twice that if they support the poses, as any set of
+many true matches has a few false ones (docs/notebook/photographs.md)."""
 _FOLLOWING_WEIGHT_IN_CUTS = 1000
-"""Times that they do where a cut is looked for: it goes through others, however many, where it can,
-rather than around single frames that few hold."""
+"""The same weight in the search for a cut: the cut prefers to go through other pairs, however many,
+rather than around single frames with few matches."""
 _ROUNDS = 15
 
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """Evidence of the matches of two pictures for or against their poses."""
+    """Support of the matches of two pictures for their poses, or against them."""
 
     one: int
     other: int
-    """Their places among the pictures."""
+    """Indices of both pictures."""
     matches: int
-    """Number of matches that speak for the poses; negative where as many speak against them."""
+    """Number of matches that support the poses; negative if they contradict them."""
     is_following: bool = False
-    """Whether they follow one another in a video."""
+    """Whether the pictures are near each other in a video."""
 
     @property
     def weight(self) -> int:
-        """How much it counts."""
+        """Weight of the vote."""
         if not self.is_following:
             return self.matches
         return FOLLOWING_WEIGHT * (2 * self.matches if self.matches > 0 else self.matches)
 
 
 def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
-    """The largest part of a reconstruction across whose borders matches contradict its poses.
+    """Reduce a reconstruction to its largest part without contradictions by matches.
 
-    The other pictures lose their poses: which of two parts is where it should be, nobody knows.
-    With pictures ``known`` from elsewhere it is the part that holds these, which stay together.
+    The other pictures lose their poses: matches do not tell which of two parts is right. With
+    ``known`` pictures it is the part that contains these, which stay together.
     """
     images = _placed(model)
     first = next((k for k, number in enumerate(images) if number in known), None)
@@ -72,7 +72,7 @@ def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
 
 
 def false_pairs(model: Any, database: Path) -> list[tuple[int, int]]:
-    """Pairs of pictures that speak for poses across the borders of the parts that others part."""
+    """Pairs of pictures whose matches support the poses across the borders of separated parts."""
     images = _placed(model)
     votes = _votes(model, database, {number: k for k, number in enumerate(images)})
     part_of = {k: n for n, part in enumerate(undivided(len(images), votes)) for k in part}
@@ -85,7 +85,7 @@ def _placed(model: Any) -> list[int]:
 
 
 def _votes(model: Any, database: Path, place: dict[int, int]) -> list[Vote]:
-    """Votes of all pairs of pictures with places of their own."""
+    """Votes of all pairs of pictures with different indices."""
     return [
         Vote(place[p.one], place[p.other], speaks_for(p), abs(p.other - p.one) <= FOLLOWING)
         for p in verified_matches(model, database, place)
@@ -94,7 +94,7 @@ def _votes(model: Any, database: Path, place: dict[int, int]) -> list[Vote]:
 
 
 def speaks_for(pair: PairMatches) -> int:
-    """Matches that speak for the poses of a pair; negative where as many speak against them."""
+    """Number of matches that support the poses of a pair; negative if they contradict them."""
     by_poses = (pair.epipolar() <= MAX_ERROR) & pair.in_front()
     R, off = best_rotation(*pair.rays)
     by_rotation = pair.focal * off <= MAX_ERROR
@@ -109,9 +109,9 @@ def speaks_for(pair: PairMatches) -> int:
 def best_rotation(
     one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "n"]]:
-    """The rotation that takes rays nearest to others, and how far each ends (about radians).
+    """The rotation that best aligns rays with others, and each residual (about radians).
 
-    Least sum of distances, by weights (Kabsch's solution of each round).
+    Least sum of distances, by reweighting (Kabsch's solution in each round).
     """
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (one, two))
     weight = np.ones(len(a))
@@ -123,10 +123,10 @@ def best_rotation(
 
 
 def undivided(count: int, votes: Sequence[Vote]) -> list[list[int]]:
-    """Parts of ``count`` pictures between which more speaks against their poses than for them.
+    """Divide ``count`` pictures into parts between which more votes contradict than support poses.
 
-    A pair of ``votes`` that contradicts is parted by the minimum cut of what speaks for all (Ford
-    and Fulkerson 1956), if across that cut more speaks against.
+    A contradicting pair of ``votes`` is separated by the minimum cut of the supporting votes (Ford
+    and Fulkerson 1956), if more votes across that cut contradict than support the poses.
     """
     parts, open_parts = list[list[int]](), [list(range(count))]
     while open_parts:
@@ -146,7 +146,7 @@ def undivided(count: int, votes: Sequence[Vote]) -> list[list[int]]:
 
 
 def _parted(count: int, votes: Sequence[Vote]) -> np.ndarray | None:
-    """Which pictures are on one side of the first cut that is to be made; none where none is."""
+    """Mask of the pictures on one side of the first necessary cut; none if no cut is."""
     joins = _graph(count, (v for v in votes if v.matches > 0))
     for vote in sorted((v for v in votes if v.matches < 0), key=lambda v: v.weight):
         side = _reached(joins, vote.one, vote.other)

@@ -18,31 +18,31 @@ from geogs_photos.photo_pairs import Pairs
 from geogs_photos.pycolmap_library import load_colmap
 
 ROUND = 40
-"""Pairs that are matched between two reports of progress."""
+"""Number of pairs matched between two reports of progress."""
 
 
 @dataclass(frozen=True, slots=True)
 class SharedCamera:
-    """A camera that took some of the pictures."""
+    """A camera of some of the pictures."""
 
     calibration: Calibration
-    """Where the search for it begins, for pictures as they are stored."""
+    """Initial calibration, for pictures as they are stored."""
     is_known: bool
-    """Whether it is to stay as it is."""
+    """Whether it is fixed."""
 
 
 def known_cameras(cameras: Sequence[SharedCamera]) -> list[int]:
-    """Numbers in the database of those that stay as they are."""
+    """Numbers of the fixed cameras in the database."""
     return [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A picture in the database; its number there is its place plus one."""
+    """A picture in the database; its number there is its index plus one."""
 
     name: str
     camera: int
-    """Place of its camera."""
+    """Index of its camera."""
     features: PhotoFeatures
 
 
@@ -70,7 +70,7 @@ def match_pairs(
     seed: int,
     progress: Callable[[float], None],
 ) -> np.ndarray:
-    """Match pairs of pictures and keep what one motion of the camera explains.
+    """Match pairs of pictures and keep the matches that one motion of the camera explains.
 
     Returns the number of kept matches between any two pictures, a symmetric matrix.
     """
@@ -106,8 +106,8 @@ def _kept_matches(colmap: Any, path: Path, count: int) -> np.ndarray:
 
 
 def _camera(colmap: Any, number: int, shared: SharedCamera) -> Any:
-    """A camera as COLMAP has it: with all of OpenCV's terms where it is known, else one focal
-    length and one radial term to begin with."""
+    """Make COLMAP's camera: with all of OpenCV's terms if it is known, else one focal length and
+    one radial term to begin with."""
     c = shared.calibration
     if not shared.is_known:
         camera = colmap.Camera.create_from_model_id(

@@ -1,4 +1,4 @@
-"""How well structure from motion knows its poses, whatever frame of reference it was solved in."""
+"""Standard deviations of the poses of structure from motion, independent of the gauge."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,13 +11,11 @@ from geogs_photos.incremental_mapping import without_poses
 from geogs_photos.pycolmap_library import load_colmap
 
 COMMON_ERROR_FACTOR = 2.3
-"""Times a deviation is larger than if all points erred by themselves: one that is seen a little
-beside its place is so in most views. Measured on videos with a truth
-(docs/notebook/photographs.md)."""
+"""Factor on the standard deviations of independent points: a point with an offset has it in most
+views. Measured on videos with a truth (docs/notebook/photographs.md)."""
 NEAREST = 0.02
-"""Part of the median depth of what a picture sees: a point nearer to it is false, and would be
-worth more than thousands of others. One in the very centre of a picture's camera, as false matches
-make it, leaves no covariance at all."""
+"""Fraction of a picture's median depth: nearer points are false, and would outweigh thousands of
+others. One in the very centre of a camera, from false matches, makes the covariance impossible."""
 
 
 def pose_deviations(
@@ -29,18 +27,17 @@ def pose_deviations(
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Standard deviations of the images' centres (world units) and orientations (radians).
 
-    From the covariance of the adjustment; what a similarity of the world
-    changes is taken out, so that it is what is left after the best alignment. Infinite where the
-    covariance cannot be computed. What other pictures see, and points in front of the lens, count
-    for nothing.
+    They are those after the best alignment: from the covariance of the adjustment, without its part
+    along similarities of the world. Infinite if the covariance cannot be computed. Observations in
+    other pictures, and points in front of the lens, are ignored.
 
     Args:
         model: the reconstruction.
-        images: those to tell of, with poses ``T_cw``, world to camera.
-        T_cw: the same.
-        is_known: whether the camera was given, or found along with the poses.
-        beside: for each image the places of those that the alignment fits, which count as unsure
-            as their matches leave them: what hangs on at an end sways with that. None fits all.
+        images: pictures to evaluate.
+        T_cw: their poses, world to camera.
+        is_known: whether the camera was given, or estimated along with the poses.
+        beside: for each image the indices of those that are aligned, which keep their uncertainty:
+            open chain ends inherit it. None aligns all.
     """
     colmap = load_colmap()
     model = _evidence(model, images, T_cw)
@@ -69,11 +66,11 @@ def without_gauge(
     T_cw: Float64[np.ndarray, "n 4 4"],
     beside: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Deviations of centres and orientations without what a similarity of the world changes.
+    """Standard deviations of centres and orientations without their part along similarities.
 
     ``joint`` is the covariance of the poses' left tangents, rotation (3) then translation (3) of
     each. With T = [Exp(w) R, t + dt] the centre -R^T t moves by R^T (w x t - dt), and the axes of
-    the camera turn by R^T w in the world. The similarity of each is that of the images ``beside``
+    the camera rotate by R^T w in the world. The similarity of each is that of the images ``beside``
     it, or all.
     """
     count = len(T_cw)
@@ -94,7 +91,7 @@ def _left(
     gauge: Float64[np.ndarray, "m g"],
     beside: Sequence[Sequence[int]],
 ) -> Float64[np.ndarray, "n"]:
-    """Deviation of each triple of J x without what lies along ``gauge`` in the triples beside."""
+    """Standard deviation of each triple of J x after a fit of ``gauge`` to the triples beside."""
     covariance, left = J @ joint @ J.T, np.zeros(len(beside))
     for k, fitted in enumerate(beside):
         own = slice(3 * k, 3 * k + 3)
@@ -107,7 +104,7 @@ def _left(
 
 
 def _evidence(model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 4"]) -> Any:
-    """The reconstruction with these pictures alone, without points nearer than ``NEAREST``."""
+    """Copy the reconstruction with these pictures alone, without points nearer than ``NEAREST``."""
     model = load_colmap().Reconstruction(model)
     own = [image.image_id for image in images]
     model, near = without_poses(model, {*model.reg_image_ids()} - {*own}), set[int]()
@@ -123,7 +120,7 @@ def _evidence(model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 
 
 
 def _covariance(model: Any, config: Any, options: Any) -> Any | None:
-    """pycolmap's covariance of the poses of an adjustment; none where it cannot be computed."""
+    """pycolmap's covariance of the poses of an adjustment; none if it cannot be computed."""
     colmap = load_colmap()
     adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
     wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
@@ -131,7 +128,7 @@ def _covariance(model: Any, config: Any, options: Any) -> Any | None:
 
 
 def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"] | None:
-    """The covariance of all poses; none where a pose was not free, or what it is overflows."""
+    """The covariance of all poses; none if a pose was fixed, or the covariance overflows."""
     joint = np.zeros((6 * len(numbers), 6 * len(numbers)))
     for a, one in enumerate(numbers):
         for b, other in enumerate(numbers[: a + 1]):

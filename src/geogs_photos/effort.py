@@ -1,4 +1,4 @@
-"""How many features of a photograph are matched where the time for their poses is limited."""
+"""Number of features of a photograph that are matched if the time for poses is limited."""
 
 import math
 
@@ -7,24 +7,24 @@ from geogs.threads import worker_count
 from geogs_photos.photo_features import MAX_FEATURES
 
 FEATURES = (MAX_FEATURES, 2896, 2048, 1448, 1024)
-"""Most features of a photograph: from one to the next matching takes half as long."""
+"""Limits on the features of a photograph: each halves the time of matching."""
 POSES = 0.5
-"""Fraction of the time that the poses may take; the map is made in the rest."""
+"""Fraction of the time for the poses; the rest is for the map."""
 LEAST_MAP = 20.0
-"""Seconds that the smallest map takes, with loading, mesh and files."""
+"""Seconds of the smallest map, with loading, mesh and files."""
 _A_PHOTOGRAPH, _ALIKE = 0.12, 0.1
-"""Seconds of one core to read a photograph and find its features, and who shows the same."""
+"""Seconds of one core to read a photograph and find its features, and to choose its pairs."""
 _TO_VERIFY, _TO_MATCH = 0.025, 0.105
-"""Seconds of one core to see whether a pair shows the same, however many features there are, and to
-match all of its features, with their square."""
+"""Seconds of one core for the preview of a pair, whatever the number of features, and to match all
+its features; the latter grows with their square."""
 _TO_START, _TO_PLACE = 0.06, 0.24
-"""Seconds to place a photograph, on any number of cores: in any case, and with all features."""
+"""Seconds to find a photograph's pose, on any number of cores: constant, and with all features."""
 _PAIRS = 20.0
-"""Pairs that are matched for each photograph, where there are many."""
+"""Matched pairs for each photograph, if there are many photographs."""
 
 
 def stages_of_poses(count: int, features: int) -> dict[str, float]:
-    """About how many seconds each stage takes that finds the poses of so many photographs."""
+    """Approximate seconds of each stage that finds the poses of ``count`` photographs."""
     part, cores = features / MAX_FEATURES, worker_count()
     pairs = min(0.5 * count * (count - 1), _PAIRS * count)
     return {
@@ -36,12 +36,12 @@ def stages_of_poses(count: int, features: int) -> dict[str, float]:
 
 
 def seconds_to_find_poses(count: int, features: int) -> float:
-    """About how many seconds all stages take together."""
+    """Approximate seconds of all stages together."""
     return sum(stages_of_poses(count, features).values())
 
 
 def features_for(count: int, seconds: float | None) -> int:
-    """The most features with which poses take their part of ``seconds``; the fewest if none do."""
+    """The most features with which poses take their fraction of ``seconds``, else the fewest."""
     if seconds is None:
         return MAX_FEATURES
     fit = (n for n in FEATURES if seconds_to_find_poses(count, n) <= POSES * seconds)
@@ -49,8 +49,8 @@ def features_for(count: int, seconds: float | None) -> int:
 
 
 def what_does_not_fit(count: int, seconds: float | None) -> str:
-    """Note or warning where the time is too short for so many photographs, or needs fewer features;
-    empty where it is enough."""
+    """Note or warning if the time is too short for ``count`` photographs or needs fewer features;
+    empty if it is enough."""
     if seconds is None or (features := features_for(count, seconds)) == MAX_FEATURES:
         return ""
     least = seconds_to_find_poses(count, features)

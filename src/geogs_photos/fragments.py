@@ -1,16 +1,16 @@
-"""Other ways where incremental mapping of a video falls into parts, or leaves frames out.
+"""Further attempts if incremental mapping of a video gives several parts, or leaves frames out.
 
-Where matches contradict a world, those that joined it falsely, as sides of a building do that look
-alike, are left out, and the rest is mapped once more. Global mapping (rotation averaging, global
-positioning, adjustment; Pan et al. 2024) takes all pairs at once. It comes next, as it takes twice
-the time of incremental mapping and places neither more nor better what that places whole. At last
-matches are verified once more with the focal length of the largest part, which short parts cannot
-tell, and mapped incrementally.
+If matches contradict a world, the pairs that joined it falsely (sides of a building that look
+alike) are removed, and the rest is mapped again. Next is global mapping (rotation averaging, global
+positioning, adjustment; Pan et al. 2024), which uses all pairs at once; it takes twice the time of
+incremental mapping, and is no better where that finds one whole part. Last, matches are verified
+again with the focal length of the largest part, which short parts do not determine, and mapped
+incrementally.
 
-What comes of that tells the camera, and how near matches lie to what one motion of it explains.
-With both, all is mapped once more: what moves by itself lies farther, and no longer pulls the poses
-along. Incremental mapping may fall for false matches then that global mapping did not, so frames
-have to stay about where they were.
+The result gives the camera and the residuals of matches that one motion of it explains. With both,
+all is mapped again: moving objects have larger residuals, and no longer affect the poses. This
+incremental mapping may accept false matches that global mapping did not, so frames have to stay
+near their previous positions.
 """
 
 import shutil
@@ -44,12 +44,13 @@ from geogs_photos.known_positions import with_known_positions
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_VIEWS = 3
-"""Pictures that see a point which passes the scale on from one to another."""
+"""Least pictures that see a point which propagates the scale between them."""
 WHOLE = 0.9
-"""Part of the frames that one reconstruction has to hold for nothing else to be tried, and of its
-frames that one of close matches has to hold at the same places."""
+"""Fraction of the frames that one reconstruction has to contain to end the attempts, and of its
+frames that the one from close matches has to contain at the same positions."""
 SAME_PLACE = 0.15
-"""Part of the extent of the path. What moves pulls frames by a tenth; a wrong world is anywhere."""
+"""Largest shift of a frame, as a fraction of the path's extent. Moving objects shift frames by a
+tenth; a wrong world has arbitrary shifts."""
 
 
 def rejoined(
@@ -60,15 +61,15 @@ def rejoined(
     seed: int,
     progress: Callable[[str, float], None],
 ) -> list[Any]:
-    """Reconstructions by the way that puts most frames into one, of close matches where these do.
+    """Reconstructions by the attempt with most frames in one, from close matches if these agree.
 
     Args:
         parts: by incremental mapping, the largest first.
         database: with verified matches of ``count`` frames.
-        count: how many frames there are.
+        count: number of frames.
         cameras: of the frames.
         seed: of the random choices.
-        progress: called with a stage and its finished part; what it raises ends the work.
+        progress: called with a stage and its finished fraction; its exceptions end the work.
     """
     known = known_cameras(cameras)
     is_known = len(known) == len(cameras)
@@ -100,10 +101,9 @@ def rejoined(
 
 
 def same_places(one: Any, other: Any) -> bool:
-    """Whether ``WHOLE`` of the frames of one reconstruction lie at the same places in the other.
+    """Whether ``WHOLE`` of the frames of one reconstruction have the same positions in the other.
 
-    The same is what is no farther off than ``SAME_PLACE`` of their extent, after the best
-    similarity.
+    Shifts up to ``SAME_PLACE`` of their extent, after the best similarity, count as the same.
     """
     images, there = placed_images(one), {image.image_id for image in placed_images(other)}
     both = [image for image in images if image.image_id in there]
@@ -115,21 +115,21 @@ def same_places(one: Any, other: Any) -> bool:
 
 
 def believed(model: Any, database: Path, known: Container[int] = ()) -> Any:
-    """The part of a reconstruction that hangs together and contradicts no matches.
+    """The part of a reconstruction that is firmly connected and contradicts no matches.
 
-    With pictures ``known`` from elsewhere it is what does with these.
+    With ``known`` pictures it is the part connected to these.
     """
     return firmly_joined(undisputed(model, database, known), known)
 
 
 def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
-    """The largest part of a reconstruction whose scale is one; the other pictures lose their poses.
+    """The largest part of a reconstruction with one scale; the other pictures lose their poses.
 
-    With pictures ``known`` from elsewhere it is all that hangs together with these.
+    With ``known`` pictures it is all that is connected to these.
 
-    Between two pictures scale is passed on by points that a third one sees as well. Where only a
-    few such points join two parts, or all of them are seen from one picture of a part, how large
-    and how far one is as seen from the other is made up: about a single centre any scale fits.
+    Points that a third picture sees, too, propagate the scale between two pictures. If only a few
+    such points join two parts, or one picture of a part sees all of them, their relative scale is
+    arbitrary: any scale about a single centre fits.
     """
     images = sorted(image.image_id for image in model.images.values() if image.has_pose)
     seen = _firm_points(model, images)
@@ -138,7 +138,7 @@ def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
 
 
 def parts_of_one_scale(model: Any, numbers: Sequence[int]) -> list[list[int]]:
-    """Places of pictures in ``numbers`` whose scale is one, part by part, the largest first."""
+    """Indices in ``numbers`` of the pictures of one scale, part by part, the largest first."""
     seen, left, parts = _firm_points(model, numbers), np.arange(len(numbers)), list[list[int]]()
     while len(left):
         kept = left[of_one_scale(seen[:, left], np.zeros(len(left), bool))]
@@ -148,7 +148,7 @@ def parts_of_one_scale(model: Any, numbers: Sequence[int]) -> list[list[int]]:
 
 
 def _firm_points(model: Any, numbers: Sequence[int]) -> csr_array:
-    """1 where a point (row) that passes the scale on is seen by one of these pictures (column)."""
+    """1 where one of these pictures (column) sees a point (row) that propagates the scale."""
     place = {number: k for k, number in enumerate(numbers)}
     views = (sorted({e.image_id for e in p.track.elements}) for p in model.points3D.values())
     firm = [seen_by for seen_by in views if len(seen_by) >= LEAST_VIEWS]
@@ -158,11 +158,11 @@ def _firm_points(model: Any, numbers: Sequence[int]) -> csr_array:
 
 
 def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndarray, "m"]:
-    """The pictures that hang together, and still would without any single one of them.
+    """Indices of the pictures that are connected, also without any single one of them.
 
     Args:
         seen: 1 where a point (row) is seen by a picture (column).
-        known: the pictures that hang together in any case.
+        known: the pictures that are connected in any case.
     """
     kept = np.arange(seen.shape[1])
     shared = (seen.T @ seen).toarray()
@@ -173,7 +173,7 @@ def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndar
             break
         _, part = connected_components(shared[np.ix_(rest, rest)] >= LEAST_POINTS, directed=False)
         if part.any():
-            # Points may join two parts though no two of their pictures share enough of them.
+            # Enough points may join two parts although no two of their pictures share enough.
             in_part = csr_array((np.ones(len(rest), np.int64), (np.arange(len(rest)), part)))
             by_part = (seen[:, rest] @ in_part > 0).astype(np.int64)
             joined = (by_part.T @ by_part).toarray() >= LEAST_POINTS
@@ -185,7 +185,7 @@ def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndar
 
 
 def _believed(parts: Sequence[Any], database: Path, is_known: bool) -> list[Any]:
-    """The believed part of each reconstruction; the largest first."""
+    """The accepted part of each reconstruction; the largest first."""
     found = (with_known_positions(believed(part, database), is_known) for part in parts)
     return sorted(found, key=lambda part: -_placed([part]))
 
@@ -202,7 +202,7 @@ def _without(
     seed: int,
     progress: Callable[[float], None],
 ) -> tuple[list[Any], Path]:
-    """Parts by incremental mapping where some pairs do not match, and the database that says so."""
+    """Parts by incremental mapping without the matches of some pairs, and that database."""
     own = database.with_name("without.db")
     shutil.copy(database, own)
     with closing(load_colmap().Database.open(own)) as opened:

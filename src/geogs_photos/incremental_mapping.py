@@ -17,23 +17,23 @@ from geogs_photos.database import SharedCamera
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_IMAGES = 3
-"""Fewest pictures of a part that counts as one."""
+"""Fewest pictures of a part."""
 LEAST_POINTS = 15
-"""Points that have to place a frame of a video."""
+"""Fewest points of a frame whose pose is accepted."""
 FREE_IMAGES = 8
-"""Pictures of a camera from which on its principal point and a second radial term are found."""
+"""Fewest pictures of a camera whose principal point and second radial term are estimated."""
 FREE_POINTS = 300
-"""Points that each of these pictures sees, in the mean, at least."""
+"""Least mean number of points in each of these pictures."""
 MAX_OFFSET = 0.08
-"""Most that a found principal point may lie from the middle, as a part of the longer side."""
+"""Largest offset of an estimated principal point, as a fraction of the longer side."""
 CLOSE = 3.0
-"""Times the mean distance of points from where they are seen, within which matches count once that
-is known. To pycolmap's usual four pixels people who cross the view agree with poses that are
-centimetres off; within less than this what rolling rows move counts too little."""
+"""Limit of the reprojection error, as a multiple of its mean, once that is known. With pycolmap's
+usual four pixels people who cross the view agree with poses that are centimetres off; a smaller
+multiple rejects too much of the shift by a rolling shutter."""
 LEAST_WITHIN = 0.3
-"""Pixels; features are hardly found where they are to less."""
+"""Least such limit, pixels: features are hardly more accurate."""
 POSE_FACTOR = 3.0
-"""Times that within which matches place a picture before it takes part in the adjustment."""
+"""Multiple of the limit for matches that give a picture its pose before the adjustment."""
 _ITERATIONS, _TOLERANCE = 50, 1e-6
 
 
@@ -46,16 +46,16 @@ def put_together(
     progress: Callable[[float], None],
     within: float | None = None,
 ) -> list[Any]:
-    """Reconstructions of the parts that hang together, the largest first.
+    """Reconstructions of the connected parts, the largest first.
 
     Args:
         database: with verified matches of ``count`` pictures.
-        work: folder for what pycolmap writes.
-        count: how many pictures there are.
-        known: numbers of the cameras that stay as they are.
+        work: folder for pycolmap's files.
+        count: number of pictures.
+        known: numbers of the fixed cameras.
         seed: of the random choices.
-        progress: called with the finished part; what it raises ends the work.
-        within: pixels that a point may be from where it is seen; none is pycolmap's usual.
+        progress: called with the finished fraction; its exceptions end the work.
+        within: limit of the reprojection error, pixels; none is pycolmap's usual.
     """
     options = _options(known, seed, min_model_size=LEAST_IMAGES)
     if within is not None:
@@ -75,17 +75,17 @@ def continued(
     seed: int,
     progress: Callable[[float], None],
 ) -> Any | None:
-    """The reconstruction of pictures whose poses are known, and of what joins them; none if these
-    see no point.
+    """Reconstruct pictures of known poses and those that join them; none if the known ones see no
+    point.
 
-    How near a point has to be to where it is seen, those of the known poses say.
+    The limit of the reprojection error follows from the points of the known poses.
 
     Args:
         database: with verified matches; its one camera is known.
-        work: folder for what pycolmap writes.
-        known: poses, world to camera, by the numbers of the pictures; they stay.
+        work: folder for pycolmap's files.
+        known: fixed poses, world to camera, by the numbers of the pictures.
         seed: of the random choices.
-        progress: called with the finished part; what it raises ends the work.
+        progress: called with the finished fraction; its exceptions end the work.
     """
     colmap = load_colmap()
     options = _options([1], seed, multiple_models=False, fix_existing_frames=True)
@@ -110,7 +110,7 @@ def continued(
 
 
 def _options(known: Sequence[int], seed: int, **more: Any) -> Any:
-    """pycolmap's, with the cameras that stay as they are."""
+    """pycolmap's options, with fixed cameras."""
     options = load_colmap().IncrementalPipelineOptions(
         num_threads=worker_count(), random_seed=seed, extract_colors=False, **more
     )
@@ -120,8 +120,8 @@ def _options(known: Sequence[int], seed: int, **more: Any) -> Any:
 
 
 def _keep_within(options: Any, within: float, cameras: Iterable[Any]) -> None:
-    """Have points lie within so many pixels of where they are seen, or their rays miss them by as
-    much; no more than usual."""
+    """Limit the reprojection errors to ``within`` pixels, and the angles of rays to the same; at
+    most pycolmap's usual limit."""
     within = min(max(within, LEAST_WITHIN), options.mapper.filter_max_reproj_error)
     angle = math.degrees(within / min(camera.mean_focal_length() for camera in cameras))
     options.mapper.filter_max_reproj_error = within
@@ -132,13 +132,13 @@ def _keep_within(options: Any, within: float, cameras: Iterable[Any]) -> None:
 
 
 def _counting(placed: int, count: int, progress: Callable[[float], None]) -> Callable[[], None]:
-    """Callback for after each picture, ``placed`` of ``count`` being placed before."""
+    """Callback after each picture; ``placed`` of ``count`` pictures had poses before."""
     numbers = itertools.count(placed + 1)
     return lambda: progress(min(next(numbers) / count, 1.0))
 
 
 def of_poses(database: Path, known: Mapping[int, Float64[np.ndarray, "4 4"]]) -> tuple[Any, int]:
-    """A reconstruction without points, and how many pictures the database holds.
+    """Make a reconstruction without points; return it and the number of pictures in the database.
 
     ``known`` are poses, world to camera, by the numbers of the pictures.
     """
@@ -155,22 +155,22 @@ def of_poses(database: Path, known: Mapping[int, Float64[np.ndarray, "4 4"]]) ->
 
 
 def largest_first(models: Mapping[int, Any]) -> list[Any]:
-    """Reconstructions that have enough pictures to count as a part, the largest first."""
+    """Reconstructions with enough pictures to count as a part, the largest first."""
     parts = [model for model in models.values() if model.num_reg_images() >= LEAST_IMAGES]
     return sorted(parts, key=lambda model: -model.num_reg_images())
 
 
 def placed_images(model: Any) -> list[Any]:
-    """Frames of a video by name; those that few points place have no pose that counts."""
+    """Frames of a video with an accepted pose, by name; those with few points are left out."""
     placed = (i for i in model.images.values() if i.has_pose and i.num_points3D >= LEAST_POINTS)
     return sorted(placed, key=lambda image: image.name)
 
 
 def without_poses(model: Any, numbers: Iterable[int]) -> Any:
-    """The reconstruction whose pictures of these numbers have lost their poses."""
+    """Remove the poses of the pictures of these numbers."""
     for number in numbers:
         model.deregister_frame(model.images[number].frame_id)
-    model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
+    model.tear_down()  # removes pictures without a pose, with which covariances fail
     return model
 
 
@@ -182,8 +182,8 @@ def world_to_camera(image: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def shifts(one: Any, other: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "n"]:
-    """How far pictures were taken in one reconstruction from where they were in another, after the
-    similarity that fits them best, in units of the other."""
+    """Distances between the pictures' centres in two reconstructions, after the best-fitting
+    similarity, in units of the other."""
     before, now = (
         torch.from_numpy(np.stack([m.images[n].projection_center() for n in numbers]))
         for m in (one, other)
@@ -193,11 +193,11 @@ def shifts(one: Any, other: Any, numbers: Sequence[int]) -> Float64[np.ndarray, 
 
 
 def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:
-    """The reconstruction adjusted once more, robustly, with more of each camera.
+    """Adjust a reconstruction again, robustly, with more parameters of each camera.
 
-    Cameras that are not known and have the pictures for it get their principal point and a second
-    radial term, unless that runs away; the others keep what they have. Pixels are square: with two
-    focal lengths, which pictures hardly tell apart, surveyed cameras came out no better.
+    Unknown cameras with enough pictures get a free principal point and a second radial term, unless
+    these diverge; the others keep their model. Pixels are square: two focal lengths, which pictures
+    hardly distinguish, did not improve surveyed cameras.
     """
     colmap = load_colmap()
     known = {place + 1 for place, camera in enumerate(cameras) if camera.is_known}
@@ -218,7 +218,7 @@ def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:
 
 
 def adjust_free(model: Any, known: Container[int]) -> None:
-    """A refined reconstruction adjusted once more, with all of the cameras that are not known."""
+    """Adjust a refined reconstruction again, with all parameters of the unknown cameras."""
     colmap, constant = load_colmap(), {number for number in model.cameras if number in known}
     _adjust(colmap, model, constant, with_centres=True)
 

@@ -1,4 +1,4 @@
-"""Frames of a video whose place structure from motion does not know."""
+"""Removal of frames whose position structure from motion does not determine."""
 
 from typing import Any
 
@@ -15,20 +15,21 @@ from geogs_photos.incremental_mapping import (
 )
 
 OUTLIER_RATIO = 3.0
-"""Deviation over the median one: where all are unsure, that is for the verdict to say."""
+"""Least ratio of an outlier's standard deviation to the median: if all are uncertain, that is left
+to the verdict."""
 
 
 def with_known_positions(model: Any, is_known: bool) -> Any:
-    """A reconstruction whose frames' places its matches tell; the others lose their poses.
+    """Keep the frames whose positions the matches determine; the others lose their poses.
 
-    What sees little but far things, or the rest of the world along one direction alone, lies
-    anywhere on a line as far as its matches go, and thereby stretches the extent of the path that
-    places are to be known by. So the worst go first, until all are known to
-    ``MAX_POSITION_DEVIATION`` of it.
+    A frame that sees little but far points, or the rest of the world in one direction only, can be
+    anywhere on a line according to its matches, and thereby enlarges the extent of the path that is
+    the measure of its uncertainty. So the worst are removed first, until all have standard
+    deviations of at most ``MAX_POSITION_DEVIATION`` of it.
 
     Args:
         model: by incremental or global mapping.
-        is_known: whether the camera was given, or found along with the poses.
+        is_known: whether the camera was given, or estimated along with the poses.
     """
     while len(images := placed_images(model)) > LEAST_IMAGES:
         T_cw = np.stack([world_to_camera(image) for image in images])

@@ -1,4 +1,4 @@
-"""Where a frame was taken, against the points of a reconstruction that other frames made."""
+"""Pose of a frame from the points of a reconstruction of other frames."""
 
 from typing import Any
 
@@ -12,19 +12,19 @@ from geogs_photos.photo_features import find_features, squared_distances
 from geogs_photos.pycolmap_library import load_colmap
 
 NEIGHBOURS = 2
-"""Frames with a pose before and after one, whose points it is matched with."""
+"""Number of frames with a pose, before and after a frame, whose points it is matched with."""
 LEAST_INLIERS = 20
-"""Points that have to agree on a pose."""
+"""Fewest inliers of an accepted pose."""
 MAX_ERROR = 4.0
-"""Pixels that a point that agrees may be off."""
+"""Largest reprojection error of an inlier, pixels."""
 _RATIO = 0.8
 
 
 class Localiser:
-    """The points that the placed frames see, with their descriptors."""
+    """Estimates poses from the points that frames with a pose see, with their descriptors."""
 
     def __init__(self, video: PlacedVideo, camera: Camera, seed: int) -> None:
-        """``camera`` is that of the frames to place."""
+        """``camera`` is that of the frames to localise."""
         self._positions, self._descriptors = video.positions, video.descriptors
         self._places = np.array(video.numbers)
         colmap = load_colmap()
@@ -37,7 +37,7 @@ class Localiser:
         self._options.ransac.random_seed = seed
 
     def place(self, frame: Frame) -> Float64[np.ndarray, "4 4"] | None:
-        """World to camera of a frame of the video; none where too few points agree."""
+        """World to camera of a frame of the video; none if there are too few inliers."""
         near = self._near(frame.index)
         positions = np.concatenate([self._positions[k] for k in near])
         descriptors = np.concatenate([self._descriptors[k] for k in near])
@@ -69,7 +69,7 @@ def matches_to_points(
 ) -> tuple[Int64[np.ndarray, "k"], Int64[np.ndarray, "k"]]:
     """Features and points that are each other's nearest by their descriptors.
 
-    The second nearest has to be clearly farther, but for the same point as another frame sees it.
+    The second nearest has to be clearly farther, unless it is the same point in another frame.
     """
     distance = squared_distances(own.astype(np.float32), descriptors.astype(np.float32)).clip(0)
     rows = np.arange(len(own))

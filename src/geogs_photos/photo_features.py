@@ -1,4 +1,4 @@
-"""SIFT features of photographs, in the form that COLMAP's matching takes."""
+"""SIFT features of photographs, in the form of COLMAP's matching."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from geogs.threads import thread_map
 from geogs.types import Frame
 
 MAX_EDGE = 1600
-"""Pictures with a longer side are reduced to it before features are looked for, pixels."""
+"""Longest side of a picture in which features are detected, pixels; longer ones are reduced."""
 MAX_FEATURES = 4096
-"""Most features of a picture, those with the strongest response."""
+"""Most features of a picture; those with the strongest response are kept."""
 _CONTRAST = 0.02
 _SIFT_RADIUS = 0.5
-"""COLMAP's scale of a feature is half the diameter that OpenCV gives."""
+"""Ratio of COLMAP's scale of a feature to OpenCV's diameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class PhotoFeatures:
 
     @classmethod
     def none(cls) -> "PhotoFeatures":
-        """The features of a picture without any."""
+        """Empty features."""
         return cls(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
 
     def __len__(self) -> int:
@@ -48,7 +48,7 @@ def find_features(
     mask: Bool[np.ndarray, "h w"] | None = None,
     most: int = MAX_FEATURES,
 ) -> PhotoFeatures:
-    """Features of an RGB picture, where its mask, if there is one, is true; at most so many."""
+    """Find at most ``most`` features of an RGB picture, inside its mask if there is one."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     reduction = max(1.0, max(width, height) / MAX_EDGE)
@@ -82,7 +82,7 @@ def squared_distances(
 
 
 def frame_features(frames: Sequence[Frame], progress: StageProgress) -> list[PhotoFeatures]:
-    """Features of frames of a video, where their masks say that they show the scene."""
+    """Features of frames of a video, inside their masks."""
     return thread_map(
         lambda frame: find_features(frame.image, frame.mask),
         frames,

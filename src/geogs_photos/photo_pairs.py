@@ -1,9 +1,9 @@
-"""Which photographs to match with which: few are all matched, of many those that look alike.
+"""Choice of the pairs of photographs to match: all of few, similar ones of many.
 
-A pair is first looked at with the largest few hundred features of both (Wu 2013, preemptive
-matching), which costs a hundredth of matching all. Beyond some hundred pictures even that is
-only done for pictures whose features are spread alike over words (VLAD, Jegou et al. 2010), and for
-neighbours by name.
+A pair is first previewed with the few hundred largest features of both (Wu 2013, preemptive
+matching), at a hundredth of the cost of full matching. Beyond some hundred pictures even that is
+only done for pictures with similar distributions of features over words (VLAD, Jegou et al. 2010),
+and for neighbours by name.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,24 +19,24 @@ from geogs_photos.photo_features import PhotoFeatures, squared_distances
 ALL_PAIRS = 20
 """Most pictures of which every pair is matched in full."""
 ALL_PREVIEWS = 200
-"""Most pictures of which every pair is looked at."""
+"""Most pictures of which every pair is previewed."""
 PREVIEW = 400
-"""Features of a picture that a first look compares."""
+"""Features of a picture in a preview."""
 LEAST_ALIKE = 6
-"""Matches in a first look from which on a pair is matched in full."""
+"""Fewest matches in a preview for full matching."""
 ALWAYS = 8
-"""Pictures most alike to each that are matched in full in any case, if they share anything."""
+"""Number of most similar pictures that are matched in full if a preview has any matches."""
 MAX_PARTNERS = 40
-"""Most pictures that one brings along, those most alike to it."""
+"""Most partners that a picture contributes, the most similar ones."""
 NEIGHBOURS = 2
-"""Next pictures by name that are matched in any case: photographs are taken one after another."""
+"""Number of next pictures by name that are always matched: photographs are often consecutive."""
 FOLLOWING = 6
-"""Frames of a video after each that it is matched with in any case."""
+"""Number of next frames of a video with which each is always matched."""
 _WORDS, _SAMPLE, _CANDIDATES = 64, 200, 60
 _RATIO = 0.85
 
 Pairs = list[tuple[int, int]]
-"""Places of two pictures each, the first before the second, ascending."""
+"""Indices of two pictures each, the first before the second, ascending."""
 
 
 def choose_pairs(
@@ -44,7 +44,7 @@ def choose_pairs(
     seed: int = 0,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Pairs:
-    """Pairs worth matching in full; how they are chosen follows from the number of pictures."""
+    """Choose the pairs to match in full, by a method that depends on the number of pictures."""
     count = len(features)
     everything = [(i, j) for i in range(count) for j in range(i + 1, count)]
     if count <= ALL_PAIRS:
@@ -58,13 +58,13 @@ def choose_pairs(
 
 
 def frame_pairs(features: Sequence[PhotoFeatures], seed: int, progress: StageProgress) -> Pairs:
-    """Pairs of a video's frames, in time order: those chosen, and each with those that follow."""
+    """Pairs of a video's frames, in time order: the chosen ones, and each with the next ones."""
     alike = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
     return sorted({*alike, *_following(len(features), FOLLOWING)})
 
 
 def mutual_matches(one: Float32[np.ndarray, "n 128"], other: Float32[np.ndarray, "m 128"]) -> int:
-    """Features that are each other's nearest, and clearly nearer than the second nearest."""
+    """Number of mutually nearest features that are clearly nearer than the second nearest."""
     if len(one) < 2 or len(other) < 2:
         return 0
     distance = squared_distances(one, other)
@@ -75,7 +75,7 @@ def mutual_matches(one: Float32[np.ndarray, "n 128"], other: Float32[np.ndarray,
 
 
 def _best(count: int, pairs: Pairs, alike: Sequence[int]) -> Pairs:
-    """The pairs that a first look speaks for, the most alike to each picture, and neighbours."""
+    """Pairs with enough matches in the preview, the most similar of each picture, neighbours."""
     of_picture: list[list[tuple[int, int]]] = [[] for _ in range(count)]
     for (i, j), matches in zip(pairs, alike, strict=True):
         if matches:
@@ -94,7 +94,7 @@ def _following(count: int, most: int) -> set[tuple[int, int]]:
 
 
 def _candidates(features: Sequence[PhotoFeatures], seed: int) -> Pairs:
-    """Pairs of pictures whose features are spread alike."""
+    """Pairs of pictures with similar distributions of features."""
     appearance = vlad([f.largest(PREVIEW) for f in features], seed)
     likeness = appearance @ appearance.T
     np.fill_diagonal(likeness, -np.inf)
@@ -105,7 +105,7 @@ def _candidates(features: Sequence[PhotoFeatures], seed: int) -> Pairs:
 def vlad(
     descriptors: Sequence[UInt8[np.ndarray, "_n 128"]], seed: int = 0
 ) -> Float32[np.ndarray, "k d"]:
-    """A unit vector for each picture: how its descriptors lie about words common to all of them.
+    """A unit vector for each picture: its descriptors' residuals to words common to all pictures.
 
     The words are the means of clusters of the pictures' own descriptors. A picture without
     descriptors gets zeros.
@@ -120,7 +120,7 @@ def vlad(
         word = ((words**2).sum(1) - 2 * rows @ words.T).argmin(1)
         residual = np.zeros_like(words)
         np.add.at(residual, word, rows - words[word])
-        # Each word counts the same, however many features it has (intra-normalisation).
+        # Each word has the same weight, however many features it has (intra-normalisation).
         residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-9)
         vector[:] = residual.ravel() / max(float(np.linalg.norm(residual)), 1e-9)
     return vectors

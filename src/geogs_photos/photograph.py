@@ -1,4 +1,4 @@
-"""Photographs in a folder: which there are, how large, and by which camera."""
+"""Photographs in a folder, with their sizes and cameras."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from geogs.io.sources.formats.image_files import SUFFIXES, image_folder, natural
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
 _QUARTER_TURNS = {6: 1, 7: 1, 3: 2, 4: 2, 8: 3, 5: 3}
-"""Clockwise turns that make a picture upright, by its EXIF orientation."""
+"""Number of clockwise quarter turns to the upright picture, by EXIF orientation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """What a picture says of the camera; pictures with the same words share their intrinsics."""
+    """Camera of a picture by its header; pictures with equal headers have the same intrinsics."""
 
     width: int
     height: int
@@ -27,14 +27,14 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """A picture on disk, its pixels taken as they are stored."""
+    """A picture on disk, in its stored orientation."""
 
     path: Path
     name: str
-    """Relative to the folder, with slashes."""
+    """Path relative to the folder, with slashes."""
     lens: Lens
     quarter_turns: int = 0
-    """Clockwise, from the stored picture to the upright one."""
+    """Number of clockwise quarter turns from the stored picture to the upright one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +42,15 @@ class PhotoFolder:
     """A folder of photographs."""
 
     root: Path
-    """What the names of the pictures are relative to."""
+    """Folder to which the names of the pictures are relative."""
     photographs: tuple[Photograph, ...]
     """In natural order of their names."""
     damaged: tuple[str, ...]
-    """Names of files that are called like pictures and cannot be read."""
+    """Names of picture files that cannot be read."""
 
 
 def find_photographs(folder: str | Path) -> PhotoFolder:
-    """The photographs in a folder, in a sub-folder called images or alike, or in all below it.
+    """Find the photographs in a folder, in its subfolder of images, or in all folders below it.
 
     Raises:
         InputError: there are none.
@@ -85,7 +85,7 @@ def _name(path: Path, root: Path) -> str:
 
 
 def _photograph(path: Path, root: Path) -> Photograph | None:
-    """A picture with what its header says; none where it is damaged."""
+    """Read the header of a picture; none if it is damaged."""
     try:
         with header_read(path) as picture:
             width, height = picture.size
@@ -95,7 +95,7 @@ def _photograph(path: Path, root: Path) -> Photograph | None:
             own += [exif.get(tag) for tag in (_LENS_MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM)]
             words = tuple("" if w is None else str(w).strip("\0 ") for w in own)
             turns = _turns(base)
-    except Exception:  # whatever a damaged file makes one of its many readers stumble over
+    except Exception:  # any error of the many readers on a damaged file
         return None
     return Photograph(path, _name(path, root), Lens(width, height, words), turns)
 

@@ -1,4 +1,4 @@
-"""Photographs in; a COLMAP model of the largest part that hangs together out, and what is not."""
+"""From photographs to a COLMAP model of the largest connected part, and the pictures left out."""
 
 import tempfile
 from collections.abc import Sequence
@@ -30,9 +30,9 @@ from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.upright import make_upright
 
 FEWEST_FEATURES = 50
-"""Features of a picture that can be matched with others."""
+"""Fewest features of a picture that can be matched."""
 FEWEST_MATCHES = 15
-"""Matches of two pictures that count as showing the same."""
+"""Fewest matches of two pictures with a common view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,9 @@ class FoundPoses:
     """Outcome of structure from motion."""
 
     left_out: tuple[tuple[str, str], ...]
-    """Names of photographs that have no pose, each with the reason as a clause."""
+    """Names of photographs without a pose, each with the reason as a clause."""
     error: float
-    """Mean distance of the points from where they were seen, pixels of the stored pictures."""
+    """Mean reprojection error, pixels of the stored pictures."""
 
 
 def find_poses(
@@ -53,23 +53,23 @@ def find_poses(
     progress: StageProgress,
     most_features: int = MAX_FEATURES,
 ) -> FoundPoses:
-    """Find where photographs were taken, and write it as a COLMAP model.
+    """Find the poses of photographs, and write them as a COLMAP model.
 
     The world is upright, in an arbitrary unit. Pixels are those of the stored pictures.
 
     Args:
         folder: the photographs.
         model: folder for ``cameras.bin``, ``images.bin`` and ``points3D.bin``.
-        intrinsics: as ``InputConfig.intrinsics``; other than auto, they are kept as they are.
+        intrinsics: as ``InputConfig.intrinsics``; fixed unless auto.
         seed: of the random choices.
         progress: follows the work.
         most_features: of a photograph; fewer take less time.
 
     Raises:
         InputError: pycolmap is missing, the intrinsics do not fit, or fewer than three photographs
-            hang together.
+            are connected.
     """
-    load_colmap()  # says at once if it is missing
+    load_colmap()  # fails at once if it is missing
     photographs = folder.photographs
     if len(photographs) < 3:
         raise InputError(
@@ -111,7 +111,7 @@ def structure_of(
     seed: int,
     progress: StageProgress,
 ) -> tuple[list[Any], np.ndarray]:
-    """Parts that hang together, largest first, and the kept matches of any two pictures."""
+    """Connected parts, largest first, and the number of kept matches of any two pictures."""
     write_database(database, cameras, entries)
     kept = match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
     parts = put_together(
@@ -124,7 +124,7 @@ def structure_of(
 def shared_cameras(
     photographs: Sequence[Photograph], intrinsics: str
 ) -> tuple[list[SharedCamera], list[int]]:
-    """One camera for all photographs whose headers name the same, and which took each."""
+    """One camera for all photographs with equal headers, and the index of each picture's camera."""
     lenses: dict[Lens, Photograph] = {}
     for photograph in photographs:
         lenses.setdefault(photograph.lens, photograph)
@@ -141,7 +141,7 @@ def shared_cameras(
 def reasons(
     entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]]
 ) -> list[tuple[str, str]]:
-    """Names of the pictures that are not in the first part, and why they are not."""
+    """Names of the pictures that are not in the first part, with the reason."""
     left_out = []
     for place, entry in enumerate(entries):
         if parts and entry.name in parts[0]:
@@ -163,7 +163,7 @@ def reasons(
 
 
 def _features(photograph: Photograph, root: Path, most: int) -> PhotoFeatures:
-    """Features of a photograph, inside its mask where there is one; none where it is damaged."""
+    """Features of a photograph, inside its mask if there is one; none if it is damaged."""
     try:
         picture = read_picture(photograph.path)
     except InputError:

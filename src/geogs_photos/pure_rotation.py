@@ -1,9 +1,8 @@
-"""Whether a reconstruction is of a camera that only turned.
+"""Test whether the camera of a reconstruction only rotated.
 
-Through a lens whose focal length is a little wrong, what a turn does to images looks like parallax,
-and points at made-up distances explain it to a tenth of a pixel. A turn through another focal
-length then does so as well, and with less freedom; of a camera that moved, however little, no one
-focal length does.
+With a slightly wrong focal length, a rotation looks like parallax, and points at arbitrary
+distances explain it to a tenth of a pixel. A rotation with another focal length explains it as
+well, with fewer parameters; no focal length does so for a camera that moved, however little.
 """
 
 from pathlib import Path
@@ -19,20 +18,20 @@ from geogs_photos.incremental_mapping import placed_images
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
 PAIRS = 60
-"""Pairs of pictures that are asked; evenly spread ones of more."""
+"""Largest number of tested pairs of pictures; evenly spread ones of more."""
 NEARLY_ALL = 0.9
-"""Part of them that a turn has to explain as well as the poses do."""
+"""Least fraction of them that a rotation has to explain as well as the poses do."""
 DEVIATION = 0.5
-"""Pixels by which matches are off, at least."""
+"""Least standard deviation of matches, pixels."""
 _FOCAL, _STEP = 0.3, 0.01
-"""Logarithms: most by which the focal length may be wrong, and how finely it is looked for."""
+"""Range and resolution of the search for the logarithm of the focal length's correction."""
 
 
 def only_rotates(model: Any, database: Path) -> bool:
-    """Whether a turn alone explains the matches of nearly all pairs of a reconstruction's pictures.
+    """Whether a rotation alone explains the matches of nearly all pairs of pictures.
 
-    One focal length serves all pairs: that at which turns leave matches least far off. Which model
-    a pair speaks for is decided by Torr's criterion (:func:`gric`).
+    All pairs have one focal length, with which rotations leave the smallest residuals. Torr's
+    criterion (:func:`gric`) selects the model of each pair.
     """
     images = [image.image_id for image in placed_images(model)]
     pairs = list(verified_matches(model, database, images))
@@ -53,8 +52,8 @@ def only_rotates(model: Any, database: Path) -> bool:
 
 
 def _off(pair: PairMatches, longer: float) -> Float64[np.ndarray, "n"]:
-    """How far the best turn leaves matches off, pixels, where the logarithm of the focal length is
-    so much longer."""
+    """Residuals of matches after the best rotation, pixels, if the logarithm of the focal length is
+    larger by ``longer``."""
     times = float(np.exp(longer))
     one, two = (rays / [times, times, 1.0] for rays in pair.rays)
     return times * pair.focal * best_rotation(one, two)[1]

@@ -1,4 +1,4 @@
-"""pycolmap, loaded when it is needed and kept quiet."""
+"""pycolmap, loaded on demand and without its output."""
 
 import signal
 import sys
@@ -11,7 +11,7 @@ from geogs.errors import InputError
 
 
 def load_colmap() -> Any:
-    """The module ``pycolmap``; what it has to say of its work is not printed.
+    """Load the module ``pycolmap``; its log is not printed.
 
     Raises:
         InputError: it is not installed, or cannot be loaded.
@@ -25,16 +25,16 @@ def load_colmap() -> Any:
             "Finding the poses of photographs needs pycolmap; pip install 'geogs[photos]' brings "
             f"it ({error})."
         ) from error
-    # Failures come back as exceptions; its lines would tear the progress line apart.
+    # Failures are raised as exceptions; its lines would disturb the progress line.
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     return pycolmap
 
 
 @contextmanager
 def _request_to_end_kept() -> Iterator[None]:
-    """Its import makes a request to end print a stack: what was there before is put back, and a
-    request that comes meanwhile waits; but for one that another thread takes in the hundredths of a
-    second until then."""
+    """Restore the handler of SIGTERM, which pycolmap's import replaces by one that prints a stack.
+
+    The signal is blocked meanwhile, except in other threads, for some hundredths of a second."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,8 +1,8 @@
-"""A rolling shutter that a video did not tell, as the residuals of structure from motion tell it.
+"""Readout of an unknown rolling shutter, estimated from residuals of structure from motion.
 
-Frames far apart share too little for their rows to be followed; points that many of them see show
-the readout all the same. Rows are put where all of them would be seen at once, by the motion of the
-camera from the frame before to the frame after, and poses and points adjusted once more.
+Frames far apart have too little in common to track rows between them, but points that many of them
+see still determine the readout. Rows are moved to where a global shutter would see them, by the
+motion of the camera from the previous to the next frame, and poses and points are adjusted again.
 """
 
 from collections.abc import Callable
@@ -17,31 +17,31 @@ from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.verified_matches import MAX_ERROR
 
 TRIAL_READOUT = 0.1
-"""Readout that is tried, of the time from one frame to the next: 20 ms of five a second."""
+"""Trial readout, as a fraction of the time between frames: 20 ms at five a second."""
 MAX_READOUT = 2.0
-"""Largest readout, over the one that is tried."""
+"""Largest readout, as a multiple of the trial readout."""
 UNSURE_FRACTION = 0.33
-"""Part of what a readout moves that stays unsure, as motion between frames is only roughly known.
-Measured on videos with a truth (docs/notebook/photographs.md)."""
+"""Standard deviation of a shift by the readout, as a fraction of it, as the motion between frames
+is only roughly known. Measured on videos with a truth (docs/notebook/photographs.md)."""
 _MAX_GAP = 2.5
-"""Times the usual step of time from which on motion between two frames is not known."""
+"""Largest time between frames with known motion, as a multiple of the median."""
 
 
 def with_rows_at_once(
     model: Any, times: Float64[np.ndarray, "n"], adjust: Callable[[Any], None]
 ) -> tuple[Any, Float64[np.ndarray, "m"]]:
-    """A reconstruction with its readout found, and the deviations that this leaves (world units).
+    """Estimate the readout; return the corrected reconstruction and its added uncertainty.
 
     Args:
-        model: its images are called by their place in ``times``.
+        model: its images are named by their index in ``times``.
         times: of the frames, seconds.
         adjust: adjusts a reconstruction in place.
 
     Returns:
-        The reconstruction, and what is to be added to the deviation of the centre of each image of
-        ``placed_images``.
+        The reconstruction, and the standard deviation (world units) to be added to that of the
+        centre of each image of ``placed_images``.
     """
-    model.update_point_3d_errors()  # those that it comes with are older than its poses
+    model.update_point_3d_errors()  # its stored errors are older than its poses
     step = TRIAL_READOUT * float(np.median(np.diff(times)))
     trials = [_adjusted(model, times, readout, adjust) for readout in (-step, step)]
     squares = [_square(m) for m in (trials[0], model, trials[1])]
@@ -55,7 +55,7 @@ def with_rows_at_once(
 
 
 def _square(model: Any) -> float:
-    """Mean squared distance of the points from where they were seen; what is far off is far off."""
+    """Mean squared reprojection error of the points, each at most ``MAX_ERROR`` squared."""
     error = np.nan_to_num([point.error for point in model.points3D.values()], nan=MAX_ERROR)
     return float(np.square(error.clip(max=MAX_ERROR)).mean())
 
@@ -63,7 +63,7 @@ def _square(model: Any) -> float:
 def _adjusted(
     model: Any, times: Float64[np.ndarray, "n"], readout: float, adjust: Callable[[Any], None]
 ) -> Any:
-    """A copy whose rows are put where all would be seen at once."""
+    """Copy a reconstruction with rows moved to a global shutter by this readout, and adjust it."""
     copy, images = load_colmap().Reconstruction(model), placed_images(model)
     places = [int(image.name) for image in images]
     T_cw, step = [world_to_camera(image) for image in images], _MAX_GAP * np.median(np.diff(times))
@@ -88,7 +88,7 @@ def _shift(
     T: Float64[np.ndarray, "4 4"],
     motion: Float64[np.ndarray, "4 4"],
 ) -> None:
-    """Move the pixels of an image's points by what its camera moved until their rows were read."""
+    """Move the pixels of an image's points by the camera's motion up to the time of their rows."""
     camera = model.cameras[image.camera_id]
     seen = [k for k, p in enumerate(image.points2D) if p.has_point3D()]
     points = np.array([model.points3D[image.points2D[k].point3D_id].xyz for k in seen])

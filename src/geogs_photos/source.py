@@ -1,4 +1,4 @@
-"""Photographs without poses: these are found once, kept beside the result, and read from there."""
+"""Photographs without poses: these are estimated once, stored with the result, and reused."""
 
 import json
 from dataclasses import asdict, replace
@@ -19,7 +19,7 @@ from geogs_photos.photograph import PhotoFolder, find_photographs
 from geogs_photos.poses import FoundPoses, find_poses
 
 NAMED = 8
-"""Photographs that were left out and are named one by one on the terminal."""
+"""Most photographs left out that are named on the terminal."""
 
 
 def open_photographs(
@@ -32,9 +32,9 @@ def open_photographs(
     stop: Stop | None = None,
     seconds: float | None = None,
 ) -> PosedSource:
-    """A source of photographs whose poses are found from themselves, or were found before.
+    """Open photographs as a source; their poses are estimated from them, or were so before.
 
-    What its arguments are, and what it raises:
+    For the arguments and errors see
     ``geogs.application.structure_from_motion.photos.open_photographs``.
     """
     progress, stop = progress or RunProgress(), stop or Stop()
@@ -72,7 +72,7 @@ def _source(
     config: ReconstructConfig,
     hold_out: int | None,
 ) -> PosedSource:
-    """The photographs that have a pose, but for those of quite other cameras."""
+    """The photographs with a pose, except those of very different cameras."""
     posed = open_colmap(model, chosen.root)
     auto = replace(config.input, intrinsics="auto", start=0, stop=None, stride=1)
     unlike = OneCamera(posed.files, auto).unlike()

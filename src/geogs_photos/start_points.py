@@ -22,7 +22,7 @@ from geogs_photos.pycolmap_library import load_colmap
 
 @runtime_checkable
 class PosedView(Protocol):
-    """An image, what of it counts, and where it was taken."""
+    """An image with its mask, camera and pose."""
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -55,10 +55,10 @@ class StartPoints:
 
 
 def find_start_points(views: Sequence[PosedView], seed: int = 0) -> StartPoints:
-    """Features, matches, triangulation; cut to the visual hull where there are masks.
+    """Find points by features, matches and triangulation; masks cut them to the visual hull.
 
     Raises:
-        InputError: pycolmap is missing, or no point comes out.
+        InputError: pycolmap is missing, or no point is found.
     """
     features = thread_map(lambda view: find_features(view.image, view.mask), views)
     pairs = choose_pairs(features, seed)
@@ -89,7 +89,7 @@ def find_start_points(views: Sequence[PosedView], seed: int = 0) -> StartPoints:
 def in_visual_hull(
     views: Sequence[PosedView], points: Float64[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "n"]:
-    """Points that no image with a mask shows outside it; unseen ones count as inside."""
+    """Mask of the points that no image shows outside its mask; unseen ones count as inside."""
     inside = np.ones(len(points), dtype=bool)
     for view in views:
         if view.mask is None:
@@ -105,7 +105,7 @@ def in_visual_hull(
 
 
 def _triangulated(database: Path, views: Sequence[PosedView], seed: int) -> Any:
-    """The reconstruction of the images of a database, in their order, with the views' poses."""
+    """Reconstruct the images of a database, in their order, with the views' poses."""
     colmap = load_colmap()
     model, _ = of_poses(database, {n: view.T_cw for n, view in enumerate(views, 1)})
     options = colmap.IncrementalPipelineOptions(

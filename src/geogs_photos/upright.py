@@ -1,4 +1,4 @@
-"""Which way is up in a world that photographs tell of."""
+"""Vertical direction of the world of photographs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_SPREAD = 0.05
-"""Second smallest eigenvalue of the cameras' x axes from which on they tell the vertical."""
+"""Least second eigenvalue of the cameras' x axes with which they determine the vertical."""
 
 
 def make_upright(model: Any, images: Sequence[Any], quarter_turns: Sequence[int]) -> None:
@@ -25,9 +25,9 @@ def upright_rotation(
 ) -> Float64[np.ndarray, "3 3"]:
     """The rotation of the world after which y points down, as in an upright image.
 
-    Photographs are mostly held level: their x axes, once they are turned upright, are horizontal,
-    and the vertical is what is most nearly at right angles to all of them. Where all look the same
-    way, the mean of their y axes has to do. The first camera looks along z as far as that goes.
+    Most photographs are level: the x axes of the upright pictures are horizontal, and the vertical
+    is the direction most nearly perpendicular to all of them. If all cameras look the same way, the
+    mean of their y axes is used. The first camera looks along z as nearly as possible.
 
     Args:
         R_cw: world to camera of each picture.
@@ -50,6 +50,6 @@ def upright_rotation(
 
 
 def _turn(quarter_turns: int) -> Float64[np.ndarray, "3 3"]:
-    """From the axes of a stored picture to those of the upright one, turned clockwise."""
+    """Rotation from the axes of a stored picture to those of the upright one, turned clockwise."""
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return np.linalg.matrix_power(quarter, quarter_turns % 4)

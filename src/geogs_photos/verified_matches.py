@@ -14,37 +14,37 @@ from geogs_photos.incremental_mapping import world_to_camera
 from geogs_photos.pycolmap_library import load_colmap
 
 MAX_ERROR = 4.0
-"""Pixels that a match may be off what explains it, as from its epipolar line."""
+"""Largest residual of a match that is explained, such as to its epipolar line, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairMatches:
-    """Matches of two pictures that one motion of the camera explains, found without any pose."""
+    """Matches of two pictures that one motion of the camera explains, found without poses."""
 
     one: int
     other: int
-    """Their numbers."""
+    """Numbers of both pictures."""
     T: Float64[np.ndarray, "4 4"]
-    """From the first camera to the second, by their poses."""
+    """First camera to second, by their poses."""
     rays: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
-    """Through the lens, at depth 1."""
+    """Undistorted rays, at depth 1."""
     focal: float
-    """Pixels."""
+    """Focal length, pixels."""
 
     def epipolar(self) -> Float64[np.ndarray, "n"]:
         """Distances of the matches from the epipolar geometry of the poses, pixels."""
         return self.focal * epipolar_distance(self.T, np.eye(3), *self.rays)
 
     def in_front(self) -> Bool[np.ndarray, "n"]:
-        """Whether what was matched lies in front of both cameras, or too far to tell."""
+        """Mask of the matches whose point is in front of both cameras, or too far to decide."""
         return in_front_of_both(self.T, *self.rays, MAX_ERROR / self.focal)
 
 
 def verified_matches(
     model: Any, database: Path, pictures: Collection[int]
 ) -> Iterator[PairMatches]:
-    """Verified matches of all pairs of some pictures that have a pose, without pixels that the lens
-    which was found does not see."""
+    """Verified matches of all pairs of some pictures with a pose, without pixels outside the
+    estimated lens."""
     colmap = load_colmap()
     with closing(colmap.Database.open(database)) as opened:
         ids, _ = opened.read_two_view_geometry_num_inliers()
@@ -66,7 +66,7 @@ def verified_matches(
 
 
 def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:
-    """Rays of all features; not finite where a lens that bends too much shows nothing."""
+    """Rays of all features; not finite outside the domain of the lens's distortion."""
     camera = model.cameras[model.images[number].camera_id]
     pixels = np.asarray(opened.read_keypoints(number), np.float64)[:, :2]
     return homogeneous(np.asarray(camera.cam_from_img(pixels), np.float64)[:, :2])

@@ -36,8 +36,9 @@ from geogs_photos.upright import make_upright
 from geogs_photos.zoom import zooms
 
 MOST_CHANGE = 0.1
-"""Relative. Where the focal length ends farther from one that the video told, both cannot be right,
-and shape and path bend with it: of a camera that turns, points at wrong distances explain any."""
+"""Largest relative change of a focal length that the video determined before. With a larger one,
+one of both is wrong, and shape and path bend: for a rotating camera, points at wrong distances
+explain any focal length."""
 
 
 def place_frames(
@@ -50,7 +51,7 @@ def place_frames(
     progress: StageProgress,
 ) -> PlacedVideo:
     """Implements ``geogs.application.structure_from_motion.photos.place_frames``."""
-    load_colmap()  # says at once if it is missing
+    load_colmap()  # fails at once if it is missing
     begin = Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,
         is_guess=not (is_known or is_found),
@@ -76,7 +77,7 @@ def place_frames(
             "and the scene to show texture."
         )
     make_upright(best, images, [0] * len(images))
-    # Before rows are told apart, which explain much of a zoom.
+    # Before the readout is estimated, which would explain much of a zoom.
     has_zoomed, unsure = zooms(best, images), np.zeros(len(images))
     if is_rolling:
         progress("finding the readout", 0.0)
@@ -118,9 +119,9 @@ def _placed(
 
 
 def _depth_deviation(model: Any, image: Any, error: float) -> float:
-    """Median relative deviation of the depths of an image's points, by their parallax.
+    """Median relative standard deviation of the depths of an image's points, by their parallax.
 
-    Of a point whose rays meet at an angle a, depth is known to error / (f a) of itself.
+    The relative standard deviation for rays that meet at an angle a is error / (f a).
     """
     focal = float(model.cameras[image.camera_id].mean_focal_length())
     centre, found = image.projection_center(), []

@@ -1,7 +1,7 @@
-"""Whether somebody zooms in a video that structure from motion takes for that of one lens.
+"""Test for a zoom in a video that structure from motion assumes to be of one lens.
 
-A zoom is explained by a motion along the view and points at wrong distances, nearly as well: points
-are two thirds of a pixel from where they were seen instead of half a one, and nothing says why.
+A motion along the view and points at wrong distances explain a zoom nearly as well: the
+reprojection error is two thirds of a pixel instead of a half, without a visible reason.
 """
 
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from geogs_photos.incremental_mapping import adjust_free
 from geogs_photos.pycolmap_library import load_colmap
 
 PARTS = 6
-"""Parts of a video that have lenses of their own."""
+"""Number of parts of a video, each with its own lens."""
 MAX_ERROR_RATIO, LEAST_CHANGE = 0.93, 0.03
-"""Reprojection error with these over that with one lens, at most, and the least relative difference
-of their focal lengths: 0.78 and 7 % where somebody zooms by four fifths,
-0.90 and 14 % where by a half in five images, 0.97 and more where nobody does
-(docs/notebook/uncertainty.md has what that leaves)."""
+"""Largest ratio of the reprojection error with these to that with one lens, and the least relative
+difference of their focal lengths: 0.78 and 7 % for a zoom by four fifths, 0.90 and 14 % for one by
+a half in five images, 0.97 and more without a zoom (docs/notebook/uncertainty.md has the
+limits)."""
 
 
 def zooms(model: Any, images: Sequence[Any]) -> bool:
-    """Whether parts of a video with focal lengths of their own explain what it shows far better.
+    """Whether separate focal lengths for the parts of a video explain it far better.
 
     Args:
-        model: an adjusted reconstruction by one camera; it stays as it is.
+        model: an adjusted reconstruction by one camera; it is not changed.
         images: its pictures, in the order of time.
     """
     if len(images) < 2 * PARTS:
@@ -36,8 +36,8 @@ def zooms(model: Any, images: Sequence[Any]) -> bool:
 
 
 def with_own_lenses(model: Any, images: Sequence[Any]) -> tuple[Float64[np.ndarray, "p"], float]:
-    """Focal lengths of the parts of a video over the common one, when everything is adjusted with
-    them, and the part that is left of the points' mean distance from where they were seen."""
+    """Adjust everything with separate focal lengths for the parts of a video; return their ratios
+    to the common one, and that of the mean reprojection errors."""
     camera = next(iter(model.cameras.values()))
     parted = _parted(model, images, camera)
     errors = []
@@ -51,7 +51,7 @@ def with_own_lenses(model: Any, images: Sequence[Any]) -> tuple[Float64[np.ndarr
 
 
 def _parted(model: Any, images: Sequence[Any], camera: Any) -> Any:
-    """A copy of the reconstruction by as many cameras as there are parts."""
+    """Copy the reconstruction with one camera for each part."""
     colmap = load_colmap()
     parted = colmap.Reconstruction()
     for number in range(1, PARTS + 1):

@@ -85,6 +85,6 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _defaults(given: Given) -> SynthOptions:
-    """The flaws of the camera asked for."""
+    """Default options: the flaws of the given camera."""
     camera = cast(CameraKind, given.get("camera", "clean"))
     return SynthOptions(Path(), camera=camera, flaws=camera_flaws(camera))

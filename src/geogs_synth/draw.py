@@ -30,7 +30,7 @@ class Draw:
         return empty.uniform_(low, high, generator=self._generator)
 
     def log_uniform(self, low: float, high: float, *shape: int) -> Float[Tensor, "..."]:
-        """Positive, with a uniform logarithm."""
+        """Log-uniform in [low, high)."""
         return self.uniform(math.log(low), math.log(high), *shape).exp_()
 
     def normal(self, deviation: float | int, *shape: int) -> Float[Tensor, "..."]:

@@ -1,4 +1,4 @@
-"""Training of the networks that are shipped: random rooms on the GPU, losses and loop."""
+"""Training of the shipped networks: random rooms on the GPU, losses and loop."""
 
 from geogs.cli.command import Command
 

@@ -15,15 +15,14 @@ from geogs_train.course import Worker
 
 MOST_PROCESSES = 6
 AHEAD = 8
-"""Plans that are ready, besides those that are being drawn."""
+"""Number of finished plans, besides those that are being drawn."""
 
 
 class PlansAhead:
-    """The plans of consecutive steps; drawing one takes longer than a step on a GPU may."""
+    """Draws the plans of consecutive steps ahead, as one takes longer than a step on a GPU."""
 
     def __init__(self, rooms: RoomSampler, batch: int, worker: Worker, least: int = 1) -> None:
-        """For a GPU, ``least`` or more processes draw them ahead; on a CPU they are drawn on
-        demand."""
+        """For a GPU, ``least`` or more processes draw ahead; on a CPU plans are drawn on demand."""
         self._on_demand = partial(rooms.plan, batch=batch, rank=worker.rank)
         self._pool: ProcessPoolExecutor | None = None
         if worker.device.type == "cuda":
@@ -37,7 +36,7 @@ class PlansAhead:
         self._waiting: deque[tuple[int, Future[bytes]]] = deque()
 
     def plan(self, step: int) -> Plan:
-        """The plan of a step; those of the steps after it are begun."""
+        """Return the plan of a step, and start to draw those of the next steps."""
         if self._pool is None:
             return self._on_demand(step)
         while self._waiting and self._waiting[0][0] != step:
@@ -49,12 +48,12 @@ class PlansAhead:
         return plan
 
     def rest(self) -> None:
-        """Discards the plans drawn ahead; none are drawn until one is asked for again."""
+        """Discard the plans drawn ahead; none are drawn until the next call of ``plan``."""
         while self._waiting:
             self._waiting.popleft()[1].cancel()
 
     def close(self) -> None:
-        """Ends the processes."""
+        """End the processes."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
@@ -63,5 +62,5 @@ def _pickled_plan(
     options: RoomOptions, materials: int, seed: int, batch: int, rank: int, step: int
 ) -> bytes:
     torch.set_num_threads(1)
-    # As bytes, so that no tensor is handed over through shared memory, which containers lack.
+    # As bytes, so that no tensor is passed through shared memory, which containers lack.
     return pickle.dumps(draw_plan(options, materials, seed, step, batch, rank))

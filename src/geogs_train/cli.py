@@ -1,4 +1,4 @@
-"""``geogs train``: makes the networks that are shipped."""
+"""``geogs train``: trains the shipped networks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -52,7 +52,7 @@ class TrainDepthOptions(Settings):
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the command; returns the exit code."""
+    """Run the command; return the exit code."""
     options: TrainOptions | TrainDepthOptions
     if "depth" in argv[:1]:
         options = parse_options(TrainDepthOptions, argv, "train")

@@ -1,4 +1,4 @@
-"""What the training of all networks has in common."""
+"""Common parts of the training of all networks."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ Panels = tuple[tuple[str, tuple[str, ...], bool], ...]
 
 @dataclass(frozen=True)
 class Worker:
-    """This process among those that train together, one for each device."""
+    """This process and its rank among the training processes, one for each device."""
 
     device: torch.device
     rank: int = 0
@@ -23,7 +23,7 @@ class Worker:
         return torch.Generator(self.device).manual_seed(key)
 
     def shared(self, value: float) -> float:
-        """The first worker's value, for all; they wait for each other."""
+        """Broadcast the first worker's value to all; they wait for each other."""
         if self.count == 1:
             return value
         first = torch.tensor([value], dtype=torch.float64, device=self.device)

@@ -1,4 +1,4 @@
-"""A training as one of the processes that torchrun starts, or alone."""
+"""A training, as one of torchrun's processes or alone."""
 
 import json
 import os
@@ -25,10 +25,10 @@ from geogs_train.training_run import LOG, train
 def launch(
     training: FlowTraining | DepthTraining, run: TrainingRunOptions, out: Path, device: str
 ) -> None:
-    """Train, and draw the curves; a run that is gone on with keeps its settings.
+    """Train, and draw the curves; a resumed run keeps its settings.
 
     Raises:
-        InputError: there is nothing to go on from.
+        InputError: there is nothing to resume.
         DeviceError: the device cannot be used.
     """
     with _worker(device) as worker:
@@ -36,13 +36,13 @@ def launch(
             training = read_options(out, type(training))
         course = course_of(training, worker)
         train(course, run, out, worker)
-        worker.shared(0.0)  # nobody leaves before the first has written everything
+        worker.shared(0.0)  # no process ends before the first has written everything
     if worker.rank == 0:
         draw_curves(out, course.curves)
 
 
 def course_of(training: FlowTraining | DepthTraining, worker: Worker) -> Course:
-    """What the settings ask for."""
+    """Make the course of these settings."""
     if isinstance(training, DepthTraining):
         return DepthCourse(training, worker)
     return FlowCourse(training, worker)
@@ -50,7 +50,7 @@ def course_of(training: FlowTraining | DepthTraining, worker: Worker) -> Course:
 
 @contextmanager
 def _worker(device: str) -> Iterator[Worker]:
-    """This process among the others, if there are any; each has the GPU of its number."""
+    """This process among the others, if there are any; each has the GPU of its local rank."""
     rank, count = (int(os.environ.get(n, d)) for n, d in (("RANK", "0"), ("WORLD_SIZE", "1")))
     used = require_device(device)
     if used.type == "cuda":
@@ -72,7 +72,7 @@ def _worker(device: str) -> Iterator[Worker]:
 def draw_curves(out: Path, panels: Panels) -> None:
     """Draw ``curves.png`` from the log of a run: the loss, then the panels of scores.
 
-    Scores in scores have names with dots; those that a run does not have are left out."""
+    Nested scores have names with dots; those that a run does not have are left out."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -105,7 +105,7 @@ def draw_curves(out: Path, panels: Panels) -> None:
 
 
 def _score(scores: dict[str, Any], name: str) -> float | None:
-    """The score of a name with dots; None where there is none."""
+    """The score of a name with dots; None if there is none."""
     found: Any = scores
     for part in name.split("."):
         found = found.get(part) if isinstance(found, dict) else None

@@ -18,11 +18,11 @@ Course = FlowCourse | DepthCourse
 Batch = TypeVar("Batch")
 
 WARM_UP = 3
-"""Steps taken before the recording, so that libraries have chosen their kernels."""
+"""Steps before the recording, in which libraries choose their kernels."""
 
 
 class StepGraph(Generic[Batch]):
-    """Loss and gradients of batches of one size; the gradients are added where they lie."""
+    """CUDA graph of the loss of batches of one size; gradients are added in place."""
 
     def __init__(self, work: Callable[[Batch], Float[Tensor, ""]], batch: Batch) -> None:
         own = {f.name: getattr(batch, f.name).clone() for f in _tensors(batch)}
@@ -46,11 +46,10 @@ class StepGraph(Generic[Batch]):
 
 
 class NetworkTrainer:
-    """A network, its optimiser and the course that it takes.
+    """A network, its optimiser and its training course.
 
-    Step n of a run depends on nothing but the seed, n, and the state after step n - 1, so that a
-    run that goes on from a checkpoint equals one that was never stopped (on the CPU to the last
-    bit).
+    Step n of a run depends only on the seed, n, and the state after step n - 1, so that a resumed
+    run equals one that was never stopped (on the CPU to the last bit).
     """
 
     def __init__(
@@ -73,20 +72,20 @@ class NetworkTrainer:
         )
         self.step = 0
         self.progress, self._paced = 0.0, paced
-        """``progress`` is the fraction of the run that is done; what is learnt depends on it."""
+        """``progress`` is the finished fraction of the run, on which batch and loss depend."""
         self._graph: StepGraph[Any] | None = None
         if fuse:
             course.compile(self.network)
 
     def advance(self) -> Float[Tensor, ""]:
-        """Take a step; returns its loss, which stays on the device."""
+        """Take a step; return its loss, which stays on the device."""
         options = self.options
         loss = self._gradients(self.course.batch(self.step, self.progress))
         if self.worker.count > 1:
             distributed.all_reduce(self._gradient)
             self._gradient /= self.worker.count
         nn.utils.clip_grad_norm_(self._parameters, options.clip)
-        # A step from a loss that is not finite would be the last.
+        # A step from a loss that is not finite would ruin all weights.
         self._gradient.nan_to_num_(0.0, 0.0, 0.0)
         for group in self.optimizer.param_groups:
             group["lr"] = options.learning_rate * schedule(self.step, self.progress, options)
@@ -101,7 +100,7 @@ class NetworkTrainer:
         return loss
 
     def begin_with(self, network: nn.Module) -> None:
-        """Take over the weights of a network of the same sizes."""
+        """Copy the weights of a network of the same sizes."""
         for mine in (self.network, self.mean):
             mine.load_state_dict(network.state_dict())
 
@@ -124,13 +123,13 @@ class NetworkTrainer:
 
 
 def schedule(step: int, progress: float, options: TrainingSchedule) -> float:
-    """Learning rate of a step over its peak: half a cosine, begun with a linear warm-up."""
+    """Learning rate of a step over its peak: half a cosine, with a linear warm-up."""
     rate = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
     return rate * min(1.0, (step + 1) / max(options.warmup, 1))
 
 
 def _on_device(network: nn.Module, device: torch.device) -> Any:
-    """Moves a network to a device, with channels last, which PyTorch's stubs do not know."""
+    """Move a network to a device, with channels last, which PyTorch's stubs do not know."""
     return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 

@@ -1,4 +1,4 @@
-"""Trained weights as they are shipped."""
+"""Trained weights for shipping."""
 
 import json
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from geogs.tracking.flow.own_network import FlowNetwork
 
 
 def write_weights(network: FlowNetwork | DepthNetwork, path: Path, step: int, **about: Any) -> None:
-    """Writes a network in half precision, with its sizes and dataclasses about it as metadata."""
+    """Write a network in half precision, with its sizes and dataclasses ``about`` as metadata."""
     tensors = {k: v.detach().cpu().half().contiguous() for k, v in network.state_dict().items()}
     about = {"options": network.options, **about}
     metadata = {name: json.dumps(asdict(value)) for name, value in about.items()}

@@ -21,7 +21,7 @@ _PARTS = ("network", "mean", "first_moment", "second_moment")
 
 
 def save_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
-    """Write all that the run needs to go on; the one before stays until the new one is whole.
+    """Write the state of the run; the previous checkpoint stays until the new one is complete.
 
     Raises:
         OutputError: it cannot be written.
@@ -49,7 +49,7 @@ def save_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
 
 
 def read_options(out: Path, kind: type[T]) -> T:
-    """The settings of the run in a folder; raises InputError where there is none of this kind."""
+    """Read the settings of the run in a folder. Raises InputError if it has none of this kind."""
     header, _ = _read(out, with_tensors=False)
     try:
         return _revived(kind, json.loads(header["options"]))
@@ -59,7 +59,7 @@ def read_options(out: Path, kind: type[T]) -> T:
 
 
 def load_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
-    """Go on from a checkpoint; raises InputError where there is none or it is damaged."""
+    """Restore a checkpoint. Raises InputError if there is none or it is damaged."""
     header, tensors = _read(out, with_tensors=True)
     step, names = int(header["step"]), [name for name, _ in trainer.network.named_parameters()]
     parts = {
@@ -83,7 +83,7 @@ def load_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
 
 
 def _revived(kind: type[T], values: dict[str, Any]) -> T:
-    """A dataclass from what ``asdict`` made of it and JSON kept."""
+    """Restore a dataclass from the JSON of its ``asdict``."""
     default: Any = kind()
     found: dict[str, Any] = {}
     for name, value in values.items():
@@ -96,7 +96,7 @@ def _revived(kind: type[T], values: dict[str, Any]) -> T:
 
 
 def _read(out: Path, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """The header of a checkpoint and its tensors by name."""
+    """Read the header of a checkpoint and its tensors by name."""
     path = out / FILE
     if not path.is_file():
         raise InputError(f"There is no checkpoint in {out}; start without --run.resume.")

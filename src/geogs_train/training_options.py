@@ -1,4 +1,4 @@
-"""Settings that the trainings of all networks have."""
+"""Common settings of the training of all networks."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -18,11 +18,11 @@ LOG = "log.jsonl"
 REPORT_EVERY = 50
 """Steps between lines of the log."""
 CLOCK_EVERY = 10
-"""Steps between looks at the clock; each waits for the device."""
+"""Steps between readings of the clock; each waits for the device."""
 
 
 class Clock:
-    """Fraction of a run that is done, where its minutes are given; ``begun`` was done before."""
+    """Finished fraction of a run of given minutes; the fraction ``begun`` was done before."""
 
     def __init__(self, minutes: float, begun: float, worker: Worker) -> None:
         self._seconds, self._begun, self._worker = 60 * minutes, begun, worker
@@ -38,7 +38,7 @@ def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) ->
     """Train until the last step or the last minute.
 
     The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
-    (their running mean in half precision) to ``out``. Ctrl-C ends it as the last minute does.
+    (their running mean in half precision) to ``out``. Ctrl-C ends it like the last minute.
 
     Raises:
         InputError: the run is paced, but has no minutes.

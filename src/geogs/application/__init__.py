@@ -1,4 +1,4 @@
-"""The program without a command line: run, reconstruct, write results, go on, evaluate."""
+"""The program without a command line: run, reconstruct, write results, resume, evaluate."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

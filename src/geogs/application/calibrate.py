@@ -1,4 +1,4 @@
-"""Before a run: focal length, shutter and mask that nobody gave, from the video itself."""
+"""Self-calibration before a run: focal length, shutter and overlay mask, where none was given."""
 
 import math
 from collections.abc import Callable
@@ -27,8 +27,8 @@ Report = Callable[[float], None]
 
 
 def without_overlay(source: Source, progress: RunProgress | None = None) -> Source:
-    """The source without what all its images show at the same place while all else moves, if nobody
-    gave a mask: a time stamp, a logo, a bonnet."""
+    """Mask out a static overlay of the source, such as a time stamp, a logo or a bonnet, if no mask
+    was given."""
     if not source.is_overlay_open:
         return source
     from geogs.io.sources.static_overlay import IMAGES, LEAST_FRAMES, static_overlay
@@ -53,11 +53,11 @@ def self_calibrated(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
 ) -> Source:
-    """The source with what nobody said of its camera estimated from the video, in one adjustment.
+    """Estimate the unknown camera parameters of the source from the video, in one adjustment.
 
-    That are the focal length and the distortion where they are a guess or nominal and may be
-    refined, and the readout of the shutter. Where the video does not tell, or after a request to
-    stop, the guess stays, the shutter counts as global, and ``progress`` says so.
+    These are the focal length and the distortion where they are a guess or nominal and may be
+    refined, and the readout of the shutter. Where the video does not determine them, or after a
+    request to stop, the guess stays, the shutter counts as global, and ``progress`` reports it.
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
     asks_lens = config.calibration.refine and source.is_calibration_open
@@ -93,7 +93,7 @@ def self_calibrated(
 
 
 def _unknowns(source: Source, asks_lens: bool, radial: bool) -> "Unknowns":
-    """What the video is asked for; a lens that is not known, too, where only the readout counts."""
+    """Parameters to estimate; an unknown lens is one, too, where only the readout is wanted."""
     from geogs.tracking.calibration.unknowns import Unknowns
 
     readout = None if source.is_shutter_open else source.shutter.readout
@@ -121,7 +121,7 @@ def _self_calibration(
 def refined(
     calibration: Calibration, working_focal: float, found: "SelfCalibration"
 ) -> Calibration:
-    """A calibration of the source's images after what was found on its working images.
+    """Update a calibration of the source's images by the estimate on its working images.
 
     ``working_focal`` is fx of the working images by ``calibration``, in their pixels.
     """
@@ -167,7 +167,7 @@ def _calibration_sentence(calibration: Calibration, assumed: str) -> str:
 
 
 def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> str:
-    """The lens as the final adjustment estimated it, and how to use it again, for a reader."""
+    """Message with the lens estimated by the final adjustment, and how to reuse it."""
     changes = []
     if found.focal != 1:
         deviation = found.deviation_focal * after.fx
@@ -190,7 +190,7 @@ def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> 
 
 
 def _shutter(found: FoundReadout) -> Shutter:
-    """The shutter that was found, global where none is believed."""
+    """The estimated shutter; global where the estimate is not accepted."""
     if not math.isfinite(found.error):
         return Shutter(origin="the video does not tell", error=found.left_open)
     told = f"the video says {_evidence(found)}"
@@ -204,7 +204,7 @@ def _evidence(found: FoundReadout) -> str:
 def _found(
     progress: RunProgress, stop: Stop, find: Callable[[Report], "SelfCalibration"]
 ) -> "SelfCalibration | None":
-    """What is found; none after a request to stop."""
+    """Run a self-calibration; none after a request to stop."""
 
     def report(fraction: float) -> None:
         progress.stage("calibration", fraction)

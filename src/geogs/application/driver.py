@@ -1,4 +1,4 @@
-"""The way of a command from its source to its files: the same for all that make a result."""
+"""Common flow of the commands that make a result, from the source to the files."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
 
 
 class Outcome(Enum):
-    """How work came to its end."""
+    """How the work ended."""
 
     FINISHED = auto()
     STOPPED = auto()
-    """A request ended it; there is something to keep."""
+    """Ended by a request; there is something to keep."""
     MEMORY_FULL = auto()
     """The memory of a GPU was full; there is something to keep."""
 
 
 class Work(ABC):
-    """Poses and a map from a source: what differs between the commands."""
+    """The part that differs between commands: poses and a map from a source."""
 
     scene: "MappedScene"
-    """What is written, once the work has ended."""
+    """The scene that is written, once the work has ended."""
     source: Source | PosedSource
-    """What it was made from."""
+    """The source of the work."""
 
     @property
     def stopwatch(self) -> Stopwatch:
@@ -56,28 +56,28 @@ class Work(ABC):
 
     @property
     def way_on(self) -> str:
-        """How to go on from a checkpoint, in a sentence; empty where it makes none."""
+        """A sentence on how to resume from a checkpoint; empty where it makes none."""
         return ""
 
     def state(self) -> object | None:
-        """The record to go on from, as a checkpoint holds it; none while there is nothing yet."""
+        """The record for a checkpoint; none while there is nothing to resume from."""
         return None
 
     @abstractmethod
     def complete(self, driver: "Driver", checkpoint: Checkpoint, new: Path) -> Outcome:
-        """All of it up to the trained map, with checkpoints on the way.
+        """Do all work up to the trained map, with checkpoints on the way.
 
-        What is to be in the result besides, and is known before its end, goes to ``new``.
+        Additional files of the result that are known before its end go to ``new``.
         Raises KeyboardInterrupt where it was stopped before there was anything to keep.
         """
 
     def write_more(self, driver: "Driver", new: Path) -> None:  # noqa: B027  # most have none
-        """Write files besides those of every result into its new folder."""
+        """Write additional files into the new folder of the result."""
 
 
 @dataclass(frozen=True)
 class Driver:
-    """Where a command computes and writes, who follows it, and who may stop it."""
+    """Device, output, progress, observer and stop request of a command."""
 
     settings: RunSettings | ReconstructSettings
     output: Path
@@ -86,21 +86,21 @@ class Driver:
     stop: Stop
     observer: RunObserver | None = None
     kernels: Compilation = field(default_factory=Compilation)
-    """Kernels for the CPU, compiled meanwhile."""
+    """Background compilation of kernels for the CPU."""
 
     def report(self, stage: str, fraction: float) -> None:
-        """Tell how far a stage is; raises KeyboardInterrupt after a request to stop."""
+        """Report progress of a stage; raises KeyboardInterrupt after a request to stop."""
         self.progress.stage(stage, fraction)
         self.stop.check()
 
     def stop_early(self, why: str = "Stopping early") -> None:
-        """Say that what there is will be kept."""
+        """Report that the work so far will be kept."""
         self.progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
 
     def map_known(
         self, scene: "Reconstruction", work: Callable[[], None], checkpoint: Checkpoint
     ) -> Outcome:
-        """Do what maps a scene of known poses; where that is stopped, keep the map so far.
+        """Map a scene of known poses by ``work``; where it is stopped, keep the map so far.
 
         Raises KeyboardInterrupt where it is stopped before there is any.
         """
@@ -118,7 +118,7 @@ class Driver:
         return Outcome.STOPPED
 
     def complete(self, work: Work) -> Result:
-        """The work to its end, or until it is stopped, then the files of what there is by then.
+        """Do the work to its end, or until it is stopped, then write the files of the result.
 
         Raises:
             KeyboardInterrupt: it was stopped before there was anything to keep, or twice.

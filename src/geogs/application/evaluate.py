@@ -38,7 +38,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.types import Trajectory
 
 _ICP_PROTOCOLS = ("samples", "vertex")
-"""Protocols whose definition holds an alignment by ICP."""
+"""Protocols that include an alignment by ICP."""
 
 
 @on_one_torch_thread
@@ -105,7 +105,7 @@ def _evaluated(settings: EvalSettings, new: Path) -> Evaluation:
 
 
 def _summary(output: Path) -> dict[str, object]:
-    """What the run said of itself; nothing if it left no summary that can be read."""
+    """The run's summary; empty if there is none that can be read."""
     try:
         return read_summary(output)
     except InputError:
@@ -122,7 +122,7 @@ def _alignment(settings: EvalSettings, summary: dict[str, object]) -> Alignment:
 def _trajectory_errors(
     settings: EvalSettings, found: Trajectory, scene: TrueScene, alignment: Alignment
 ) -> TrajectoryErrors:
-    """Errors of one of the trajectories in metres; its transform takes the map's unit to them."""
+    """Errors of one of the trajectories in metres; its transform maps map units to metres."""
     # A map in the frame of the true poses has their unit; for others the factor is free.
     estimate = scaled(found, scene.metres)
     errors = evaluate_trajectory(estimate, scene.trajectory, settings.max_diff, alignment)
@@ -131,9 +131,9 @@ def _trajectory_errors(
 
 
 def _reliability(output: Path, errors: TrajectoryErrors) -> Reliability | None:
-    """The errors of the frames beside what the run said of them; none where it said nothing.
+    """Compare the frames' errors with the run's standard deviations; none where it gave none.
 
-    What it says is what a similarity leaves of the errors, so another alignment has none.
+    These are for errors after alignment by a similarity; other alignments have no comparison.
     """
     table = output / "trajectory_uncertainty.csv"
     if errors.alignment != "sim3" or not table.is_file():
@@ -162,7 +162,7 @@ def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
 def _draw(
     settings: EvalSettings, new: Path, evaluation: Evaluation, surface: SurfaceComparison | None
 ) -> list[tuple[str, Path]]:
-    """Pictures of this command, then those that the run left; titles and files."""
+    """Draw the pictures of this command; these, then those of the run: titles and files."""
     from geogs.evaluation.pages import plots
     from geogs.evaluation.pages.shading import viewpoints
 
@@ -187,19 +187,19 @@ def _draw(
 
 
 def _run_pictures(settings: EvalSettings) -> list[tuple[str, Path]]:
-    """What the run drew without knowing the truth; titles and files."""
+    """Pictures drawn by the run, without truth; titles and files."""
     return [(title, settings.output / "report" / name) for name, title in PICTURES.items()]
 
 
 def _model_beside_truth(
     folder: Path, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
 ) -> ShownModel | None:
-    """What the page of an evaluated result shows; none where no map was saved.
+    """The model for the page of an evaluated result; none where no map was saved.
 
     Args:
-        folder: of the result.
-        trajectory: its errors in metres, with the similarity that takes the map to the truth.
-        surface: what its mesh was compared with, in metres, if it was.
+        folder: folder of the result.
+        trajectory: its errors in metres, with the similarity from the map to the truth.
+        surface: the comparison of its mesh, in metres, if there is one.
     """
     try:
         result = load_result(folder)

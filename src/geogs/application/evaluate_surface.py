@@ -1,4 +1,4 @@
-"""The part of an evaluation that compares surfaces, by the protocol that was asked for."""
+"""Comparison of surfaces in an evaluation, by the chosen protocol."""
 
 import re
 from pathlib import Path
@@ -50,7 +50,7 @@ def compare_surface(
 
 
 def photoconsistency(settings: EvalSettings, scene: TrueScene, mesh: Surface) -> PhotoScores:
-    """How well every so many images agree with others on a mesh in metres."""
+    """Photo-consistency of every ``photo_every``-th image with others on a mesh in metres."""
     source = scene.images(_PHOTO_EDGE)
     views = photographs(source)
     held_out = range(settings.photo_every // 2, len(views), settings.photo_every)

@@ -1,4 +1,4 @@
-"""Signals as a request to stop: work does at the next safe point, and keeps what there is."""
+"""Signals as requests to stop: work stops at the next safe point, and keeps its results."""
 
 import os
 import signal
@@ -7,30 +7,30 @@ from collections.abc import Callable
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that ask to stop: of a terminal, of schedulers, of a terminal that is gone."""
+"""Signals to stop: from a terminal, from schedulers, from a closed terminal."""
 _RETRY_SECONDS = 0.02
-"""Seconds until it is looked again whether modules are still being imported."""
+"""Interval of checks whether modules are still being imported, in seconds."""
 _MAX_IMPORT_SECONDS = 5.0
-"""Seconds after which an import that was asked to end counts as hanging."""
+"""Seconds after a signal until an import counts as hanging."""
 
 
 def handled_signals() -> list[signal.Signals]:
-    """The ``SIGNALS`` that nobody has asked to be ignored, as nohup and shells in scripts do."""
+    """The ``SIGNALS`` that are not ignored; nohup and shells in scripts ignore some."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Handler of a signal: raises KeyboardInterrupt, in an import as soon as that is done.
+    """Handle a signal: raise KeyboardInterrupt; during an import, as soon as that is done.
 
-    A module of which an exception has left one half makes others fail with anything. Another signal
-    in an import ends the process where that seems to hang, and changes nothing before: an end at
-    once would leave behind what was begun, such as an empty folder.
+    A half-imported module makes others fail with any error. Another signal during an import ends
+    the process only where the import seems to hang: an end at once would leave unfinished work
+    behind, such as an empty folder.
     """
     is_waiting, left = signal.getitimer(signal.ITIMER_REAL)
     if not _is_importing(frame):
         signal.setitimer(signal.ITIMER_REAL, 0)
         raise KeyboardInterrupt
-    # The timer's interval, which is never reached, is what is left of the patience.
+    # The timer's interval, which is never reached, stores the time left for the import.
     left = max(left - _RETRY_SECONDS, _RETRY_SECONDS) if is_waiting or left else _MAX_IMPORT_SECONDS
     if number in SIGNALS and left <= _RETRY_SECONDS:
         os._exit(128 + number)
@@ -47,7 +47,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 class Stop:
-    """A request to stop; nobody makes this one. It may be entered again and again."""
+    """A request to stop, which no signal makes here. It may be entered repeatedly."""
 
     requested = False
 
@@ -59,16 +59,16 @@ class Stop:
         pass
 
     def request(self) -> None:
-        """Ask to stop."""
+        """Request to stop."""
         self.requested = True
 
     def check(self) -> None:
-        """A safe point inside a long stage: raises KeyboardInterrupt after a request."""
+        """Mark a safe point of a long stage: raises KeyboardInterrupt after a request."""
         if self.requested:
             raise KeyboardInterrupt
 
     def lets_finish(self, work: Callable[[], object]) -> bool:
-        """Do some work; false where a request to stop ended it at a safe point."""
+        """Do some work. Returns false if a request to stop ended it at a safe point."""
         try:
             work()
         except KeyboardInterrupt:
@@ -79,15 +79,15 @@ class Stop:
 
 
 class Interruption(Stop):
-    """While it is entered, the first Ctrl-C only sets ``requested``; the second quits.
+    """Stop request by signals: inside, the first Ctrl-C only sets ``requested``; the second quits.
 
-    SIGTERM, by which systems and schedulers end programs, is the same, and so is SIGHUP, which a
-    terminal leaves behind. What is ignored stays so.
+    SIGTERM, of systems and schedulers, has the same effect, and so has SIGHUP, of a closed
+    terminal. Ignored signals stay ignored.
     """
 
     def __enter__(self) -> "Interruption":
         super().__enter__()
-        # Python takes signals in the main thread alone.
+        # Python handles signals in the main thread only.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
             self._before = {n: signal.signal(n, self._handle) for n in handled_signals()}

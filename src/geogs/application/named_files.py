@@ -1,4 +1,4 @@
-"""The files and folders that settings name, and which of them a checkpoint may have opened."""
+"""Files and folders named by settings, and the check of those named by a checkpoint."""
 
 import os
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ S = TypeVar("S")
 
 
 def with_absolute_paths(settings: S) -> S:
-    """The same settings, with paths that hold wherever they are read."""
+    """The same settings with absolute paths."""
 
     def absolute(name: str | Path) -> str | Path:
         return name if live_address(name) else type(name)(expanded(name).absolute())
@@ -27,7 +27,7 @@ def with_absolute_paths(settings: S) -> S:
 
 
 def without_files_outside(settings: S, folder: Path) -> S:
-    """The same settings, without what they name that does not lie in a folder."""
+    """The same settings, with defaults in place of names outside a folder."""
     found = dict[tuple[str, ...], object]()
     usual = {leaf.path: leaf.default for leaf in leaves(type(settings))}
     for leaf in _naming(settings):
@@ -37,8 +37,8 @@ def without_files_outside(settings: S, folder: Path) -> S:
 
 
 def with_files_of(settings: S, others: S) -> S:
-    """The same settings, with files where others name them: another source, which is known by its
-    fingerprint, and files of the same name in other folders."""
+    """The same settings with the paths of ``others``: for the source, which is checked by its
+    fingerprint, and for files of the same name in other folders."""
     theirs, found = {leaf.path: leaf for leaf in _naming(others)}, dict[tuple[str, ...], object]()
     for leaf in _naming(settings):
         other, is_source = theirs.get(leaf.path), leaf.mark(Positional) is not None
@@ -48,7 +48,7 @@ def with_files_of(settings: S, others: S) -> S:
 
 
 def options_missing(settings: object, wanted: object) -> list[str]:
-    """Options by which ``wanted`` names files, and ``settings`` none."""
+    """Options that name files in ``wanted`` but not in ``settings``."""
     here = {leaf.path for leaf in _naming(settings)}
     return [_option(leaf) for leaf in _naming(wanted) if leaf.path not in here]
 
@@ -60,7 +60,7 @@ def _names(leaf: Leaf) -> tuple[str | Path, ...]:
 
 
 def _naming(settings: object) -> Iterator[Leaf]:
-    """The settings that name something now."""
+    """The settings that name a file or folder."""
     for leaf in leaves(settings):
         if leaf.kind.base is Path:
             names_any = leaf.default not in (None, ())
@@ -72,13 +72,13 @@ def _naming(settings: object) -> Iterator[Leaf]:
 
 
 def _names_file(text: str, words: tuple[str, ...]) -> bool:
-    """Whether a text is the name of a file, there or not, rather than another word."""
+    """Whether a text is the name of a file, existing or not, rather than another word."""
     is_word = not text or text.strip().lower() in words
     return not is_word and (os.sep in text or "\0" in text or os.path.lexists(expanded(text)))
 
 
 def _is_inside(name: str | Path, folder: Path) -> bool:
-    """Whether a name leads into a folder; of what it says outside nothing is even looked for."""
+    """Whether a name leads into a folder; nothing outside is accessed."""
     if live_address(name) is not None:
         return False
     said, here = (Path(os.path.abspath(expanded(path))) for path in (name, folder))
@@ -91,6 +91,6 @@ def _last(leaf: Leaf) -> list[str]:
 
 
 def _option(leaf: Leaf) -> str:
-    """How a setting is given on the command line."""
+    """A setting as written on the command line."""
     is_first = leaf.mark(Positional) is not None
     return leaf.name.upper() if is_first else f"{leaf.options[-1]} {leaf.path[-1].upper()}"

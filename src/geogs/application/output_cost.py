@@ -1,8 +1,8 @@
-"""What the mesh and the files of a reconstruction are going to take: a rehearsal with a few views.
+"""Time estimate of a reconstruction's mesh and files, by a trial with a few views.
 
-Some of it is done once for each view, some once for each piece of the surface. Both are measured on
-views that show the same place, with larger voxels, and multiplied by how many views there are and
-how many more voxels the surface of all of them has.
+One part is proportional to the views, one to the surface. Both are measured on views of the same
+region, with larger voxels, and multiplied by the number of views and by the ratio of the voxels of
+the whole surface.
 """
 
 import logging
@@ -24,26 +24,26 @@ from geogs.reconstruction import Reconstruction
 _log = logging.getLogger(__name__)
 
 VIEWS = 3
-"""Views of the rehearsal; one of them alone makes ready what is needed but once, before it."""
+"""Number of views of the trial; before it, one view alone does the one-time preparations."""
 ONE_VIEW = 0.3
-"""Weight from which a surface counts in a rehearsal: what one view has seen is part of it, too, as
-all views together are going to confirm it."""
+"""Least weight of a surface in the trial: surface seen by one view counts, too, as all views
+together will confirm it."""
 COARSER = 2.0
-"""Size of a voxel of a rehearsal, in voxels that all views are going to have."""
+"""Voxel size of the trial relative to the final one."""
 CAUTION = 1.1
-"""Factor on what was measured: the whole volume is larger, and the disks are not there yet."""
+"""Safety factor on the measured time: the whole volume is larger, and there are no disks yet."""
 MAX_SURFACE = 4.0
-"""Largest surface that is expected before the depths tell it, in surfaces of the rehearsal: of a
-large scene only a few views may be affordable, and what is kept for its mesh is lost to them."""
+"""Largest expected surface before all depths are known, relative to the trial's: of a large scene
+only a few views may be affordable, and time reserved for its mesh is lost to them."""
 MAX_MESH_TIME = 0.3
-"""Fraction of the time left which mesh and files may take; where they would take more, the mesh
-gets fewer triangles."""
+"""Largest fraction of the time left for mesh and files; if they would take more, the mesh gets
+fewer triangles."""
 MIN_TRIANGLES = 0.25
-"""Fraction of its triangles that it keeps in any case, and not fewer than a thousand."""
+"""Least fraction of its triangles that the mesh keeps, and at least a thousand."""
 
 
 class MeshTimes:
-    """How long the stages of a mesh take, from the reports of its progress."""
+    """Durations of the stages of mesh extraction, from its progress reports."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -62,24 +62,24 @@ class MeshTimes:
 
 @dataclass(frozen=True)
 class _Rehearsal:
-    """Seconds that some views took."""
+    """Result of a trial: seconds that some views took."""
 
     report: float
-    """The report, and what else is written once."""
+    """Report and other files written once."""
     a_view: float
-    """Each view."""
+    """Time per view."""
     surface: float
-    """The surface that they show."""
+    """Time for their surface."""
     blocks: int
-    """Blocks of its volume, had its voxels been as small as planned."""
+    """Blocks of its volume at the final voxel size."""
     triangles: int
-    """Triangles of its surface, likewise."""
+    """Triangles of its surface at the final voxel size."""
 
 
 class OutputForecast:
-    """What the mesh and the files are going to take, the better known the more of the map there is.
+    """Time estimate of mesh and files, refined as the map becomes known.
 
-    A rehearsal does all of it with a few views, and leaves nothing.
+    A trial does all of it with a few views, and leaves no files.
     """
 
     def __init__(self, scene: Reconstruction, clock: Clock = time.perf_counter) -> None:
@@ -88,23 +88,23 @@ class OutputForecast:
         self._found: _Rehearsal | None = None
 
     def first(self, times_the_surface: Callable[[Sequence[int]], float]) -> OutputCost:
-        """Once some depths have been searched: rehearsed with these.
+        """First estimate, by a trial with the depths searched so far.
 
-        ``times_the_surface`` gives how much more surface all views show than some, given by their
-        indices. Where little time is left, the scene's mesh gets a smaller budget of triangles.
+        ``times_the_surface`` gives the ratio of the surface of all views to that of some, given by
+        their indices. Where little time is left, the scene's mesh gets fewer triangles.
         """
         scene = self._scene
         views = _neighbouring(scene)
         _rehearse(scene, views[:1], self._clock)
         found = self._found = _rehearse(scene, views, self._clock)
-        # However much surface there is, its triangles are no more than this.
+        # The triangle budget limits the mesh of any surface.
         most = max(scene.config.mesh.triangle_budget / max(found.triangles, 1), 1.0)
         times = min(times_the_surface([scene.table.images[i] for i in views]), most, MAX_SURFACE)
         times *= self._affordable_triangles(found, times)
         return _cost(found, COARSER**2 * times)
 
     def settled(self) -> OutputCost:
-        """Once all depths have been checked: with the surface that these show."""
+        """Final estimate, by the surface of all checked depths."""
         scene, found = self._scene, self._found
         assert found is not None, "rehearsed before"
         try:
@@ -115,7 +115,7 @@ class OutputForecast:
         return _cost(found, COARSER**2 * times)
 
     def _affordable_triangles(self, found: _Rehearsal, times: float) -> float:
-        """The part of the triangles for which there is time; the scene's mesh is set so."""
+        """Fraction of the triangles for which there is time; sets the scene's triangle budget."""
         scene, mesh = self._scene, self._scene.config.mesh
         surface = CAUTION * COARSER**2 * times * found.surface
         spare = MAX_MESH_TIME * scene.budget.left - CAUTION * found.report
@@ -129,7 +129,7 @@ class OutputForecast:
 
 
 def _neighbouring(scene: Reconstruction) -> list[int]:
-    """Ids of mapped keyframes that were taken near each other."""
+    """Ids of neighbouring mapped keyframes."""
     mapped, views = scene.table.map.mapped, scene.mapper.views
     return [view.id for view in views.near(views[mapped[0]], mapped, VIEWS)]
 
@@ -156,7 +156,7 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
             blocks, triangles = plan.blocks, plan.triangles
             coarse = replace(config, voxel=COARSER * plan.voxel)
             mesh = extract_mesh(fusion_views(renders), coarse, times)
-        except InputError:  # these views show no surface: the others may
+        except InputError:  # these views show no surface; others may
             times("merge", 1, 1)
         fused = clock()
         write_pictures(Path(folder) / "report", scene.trajectory(), renders)

@@ -1,4 +1,4 @@
-"""The images of a source that make the map: chosen by where they were taken, then read."""
+"""The images of a source for the map: selected by their poses, then read."""
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
@@ -25,14 +25,14 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress
 from geogs.types import Trajectory
 
-# Points of the scene by which the usual depth of each image is found, at most.
+# Largest number of scene points for the typical depth of each image.
 _MAX_DEPTH_POINTS = 4000
 
 
 class PosedViews:
-    """Gives a reconstruction the images of a source, those first that say most.
+    """Gives a reconstruction the images of a source, the most informative first.
 
-    An image is read when it is given, the next one meanwhile; none is kept here.
+    An image is read when it is given, and the next one ahead; none is kept here.
     """
 
     def __init__(self, scene: Reconstruction, source: PosedSource, report: StageProgress) -> None:
@@ -46,10 +46,10 @@ class PosedViews:
         scene.know(Trajectory(source.timestamps, T_wc, known))
 
     def first_look(self) -> Float64[np.ndarray, "n 3"]:
-        """Points of the scene: those of the source, or where some small images match.
+        """Find points of the scene: those of the source, or by matching some small images.
 
-        Where the map starts from points and the source has none, those of features of the images,
-        evenly spread where they are too many.
+        If the map starts from points and the source has none, image features are triangulated, in
+        evenly spread images if there are too many.
 
         Raises:
             InputError: there is one image only, or hardly anything matches anywhere.
@@ -78,7 +78,7 @@ class PosedViews:
             )  # fmt: skip
 
     def choose(self, points: Float64[np.ndarray, "n 3"]) -> None:
-        """Put the images into an order in which every beginning shows the scene well."""
+        """Order the images such that each prefix covers the scene well."""
         with self._scene.stopwatch("choosing views"):
             source, config = self._source, self._scene.config
             typical, random = usual_depths(source, points), np.random.default_rng(config.seed)
@@ -90,7 +90,7 @@ class PosedViews:
         self._order = islice(order, config.search.most_views)
 
     def give(self, count: int | None = None) -> None:
-        """The next so many images, or all that there are.
+        """Add the next ``count`` images to the scene, or all.
 
         Raises:
             InputError: an image cannot be read.
@@ -100,14 +100,14 @@ class PosedViews:
         self.give_these(indices)
 
     def give_these(self, indices: Sequence[int]) -> None:
-        """The images of the source with these indices, in this order."""
+        """Add the images with these indices to the scene, in this order."""
         source, scene = self._source, self._scene
         for done, image in enumerate(read_side_by_side(source.__getitem__, indices)):
             scene.add(image.image, image.T_cw, image.mask, image.timestamp, image.index)
             self._report("reading", (done + 1) / len(indices))
 
     def times_the_surface(self, indices: Sequence[int]) -> float:
-        """How much more of the scene all images see than those with some indices."""
+        """Ratio of the scene points seen by all images to those seen by some indices."""
         if self._seen is None:
             return 1.0
         some = np.isin(self._seen.view, indices)

@@ -1,4 +1,4 @@
-"""The monocular prior that settings ask for."""
+"""Choice of the monocular prior by the settings."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -36,11 +36,11 @@ from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
 
 RECORDED = 4000
-"""Pixels of the longer side of a photograph, about, where its size is taken as it is."""
+"""Approximate longer side, in pixels, of photographs that are used at full size."""
 FIRST_BATCH = 24
-"""Images read before it is known for how many the time lasts: some show what one costs."""
+"""Number of images read first; they show the cost per image, and so how many are affordable."""
 _MIN_BUDGET = 1.0
-"""Seconds that are left of a budget at least, when reading and checking have used it up."""
+"""Least seconds left of a budget, even if reading and checking have used it up."""
 
 
 def left_of(budget: float | None, begin: float) -> float | None:
@@ -54,7 +54,7 @@ def left_of(budget: float | None, begin: float) -> float | None:
 def _compiled(
     device: torch.device, kernels: Compilation, budget: float | None, progress: RunProgress
 ) -> float:
-    """Seconds to wait until all is compiled: once on a machine, and in no budget."""
+    """Wait until all is compiled, once per machine. Returns the seconds, which no budget counts."""
     if budget is not None and kernels.is_working:
         progress.write(
             "note: Kernels are compiled first, once on this machine; the --budget begins after it."
@@ -73,15 +73,15 @@ def reconstruct(
     check: bool = True,
     progress: RunProgress | None = None,
 ) -> Result:
-    """Map and mesh of images with known poses, or of photographs; nothing is written.
+    """Reconstruct map and mesh from images with known poses, or from photographs; writes no files.
 
     Args:
-        source: a folder or file as ``open_posed_source`` takes it, or what that opened.
+        source: a folder or file for ``open_posed_source``, or its result.
         config: all settings; the defaults if none.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
-        budget: about how many seconds it may take in all; none trains until it is good.
+        budget: approximate total time in seconds; none trains to convergence.
         poses: given with the images, or auto: found from the photographs in a folder.
-        check: whether to see first, by matching images, that given poses fit them.
+        check: whether to check first, by matching images, that given poses fit them.
         progress: follows the work.
 
     Raises:
@@ -173,7 +173,7 @@ class MappedImages(Work):
         self._has_depths = False
 
     def state(self) -> ReconstructState | None:
-        """What a checkpoint holds; nothing before the depths are done."""
+        """The checkpoint record; none before the depths are done."""
         if not self._has_depths:
             return None
         return ReconstructState(self._made_from, self.scene.settle())
@@ -183,10 +183,10 @@ class MappedImages(Work):
         self._snapshots.write(new, self.scene, driver.progress)
 
     def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
-        """Search the depths, grow and train the map; or go on from a checkpoint.
+        """Search the depths, grow and train the map; or resume from a checkpoint.
 
         Raises:
-            InputError: nothing can be gone on with, or the images show no scene.
+            InputError: there is nothing to resume, or the images show no scene.
             KeyboardInterrupt: it was stopped before there was a map.
         """
         settings, scene, progress = self._settings, self.scene, driver.progress
@@ -217,7 +217,7 @@ class MappedImages(Work):
 
 
 def _say_whether_poses_fit(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
-    """Whether the poses fit the images. Raises InputError if they clearly do not."""
+    """Warn if the poses do not fit the images. Raises InputError if they clearly do not."""
     if progress is not None and checked is not None:
         warning = checked.result().warning
         progress.write(f"warning: {warning}" if warning else "")
@@ -231,9 +231,9 @@ def _complete(
     budgeted: bool,
     checks: RunProgress | None,
 ) -> None:
-    """Everything up to the trained map; what ``report`` raises ends it early.
+    """Do all work up to the trained map; an exception of ``report`` ends it early.
 
-    ``checks`` hears where the poses do not fit the images; none where that is not checked.
+    ``checks`` is warned if the poses do not fit the images; none where that is not checked.
     """
     views = PosedViews(scene, source, report)
     if resumed is not None:
@@ -245,7 +245,7 @@ def _complete(
         try:
             points = views.first_look()
         except InputError:
-            # Whether the poses are of another convention says more than that nothing matches.
+            # An error on the pose convention is more helpful than one on missing matches.
             _say_whether_poses_fit(checks, checked)
             raise
         _say_whether_poses_fit(checks, checked)
@@ -271,7 +271,7 @@ def _complete(
 
 
 def _chosen_views(scene: Reconstruction, asked: ReconstructConfig) -> str:
-    """What to say where not all images make the map, or its mesh is coarse; else nothing."""
+    """Message if not all images are used, or the mesh is coarse; else empty."""
     said = []
     if scene.with_depth < scene.frames:
         said.append(

@@ -1,4 +1,4 @@
-"""What to do where a run lost its camera, or is not reliable: the command that may help."""
+"""Suggested command where a run lost tracking, or is not reliable."""
 
 import shlex
 
@@ -27,10 +27,10 @@ def remedy(
     judged: Verdict | None,
     took: float = 0.0,
 ) -> str:
-    """The one command that most likely helps, with about the time it takes, in a sentence.
+    """A sentence with the command that most likely helps, and the time it takes.
 
-    Empty where the result needs none. ``judged`` is none where no frame was tracked; ``took`` are
-    the seconds of this run, if it came to an end.
+    Empty where the result needs none. ``judged`` is none where no frame was tracked; ``took`` is
+    the time of this run in seconds, if it finished.
     """
     is_placed_enough = not is_wanted(judged)
     if isinstance(source, PosedSource) or (judged and judged.is_reliable and is_placed_enough):
@@ -55,7 +55,7 @@ def remedy(
 
 
 def arguments(settings: RunSettings) -> str:
-    """Sources and what decides most, as typed behind ``geogs run``."""
+    """Sources and main options, as arguments of ``geogs run``."""
     words = [str(path) for path in settings.source]
     name, given, usual = preset_of(settings.config), settings.config.input, InputConfig()
     words += [] if name == "default" else ["--preset", name]

@@ -1,6 +1,6 @@
-"""What the commands that take a result are given: the same records for a command and a script.
+"""Settings of the commands that take a result, for a command and a script.
 
-Nothing here is imported but the settings, so that a command line can be read at once.
+This module imports only the settings, so that a command line can be read at once.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ Format = Literal[
 ]  # fmt: skip
 
 HERE = "127.0.0.1"
-"""Address that only this machine sees."""
+"""Address that only this machine can reach."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A run, from the paths of its videos to the files of its result; or on from a checkpoint."""
+"""A run, from the paths of its videos or from a checkpoint to the files of its result."""
 
 import math
 from contextlib import nullcontext
@@ -48,8 +48,8 @@ def run(
 ) -> Result:
     """Open the sources, calibrate, track and map every frame, write the results.
 
-    Where ``settings.offline`` says so, frames are placed by structure from motion instead. Kernels
-    for the CPU may be compiled already by others, whom somebody else stops.
+    With ``settings.offline``, frames are located by structure from motion instead. ``kernels`` is a
+    compilation that is running already; the caller stops it.
 
     Raises:
         InputError: a source, a setting or a prior cannot be used.
@@ -95,7 +95,7 @@ def run(
 
 
 def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
-    """The sources; to go on in a map whose lens was found, through the pinhole of its keyframes."""
+    """Open the sources; to continue a map with an estimated lens, in its keyframes' pinhole."""
     config = settings.config
     if base is None:
         return open_source(settings.source, config.input)
@@ -106,7 +106,7 @@ def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
 
 
 def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Result:
-    """Raises TrackingLost, with what may help, if no frame could be tracked, nor placed."""
+    """Do the work. Raises TrackingLost, with a remedy, if no frame could be tracked or located."""
     try:
         return driver.complete(work)
     except TrackingLost as lost:
@@ -115,12 +115,12 @@ def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> 
 
 
 def _is_live(settings: RunSettings) -> bool:
-    """Whether a source does not wait for the run."""
+    """Whether a source is live."""
     return any(map(live_address, settings.source))
 
 
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
-    """Whether the map is made once, after the video; by default where nobody looks on."""
+    """Whether the map is made once, after the video; by default if there is no viewer."""
     mapping = settings.config.mapping
     if not mapping.may_follow or _is_live(settings):
         return False
@@ -129,7 +129,7 @@ def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool
 
 
 def seen_by(base: SavedResult, config: Config) -> InputConfig:
-    """How a source is read that the camera of an earlier result took, if nobody says otherwise."""
+    """Input settings with the intrinsics of an earlier result, unless others are given."""
     known = base.folder / "intrinsics.json"
     if config.input.intrinsics.strip().lower() != "auto" or not known.is_file():
         return config.input
@@ -139,7 +139,7 @@ def seen_by(base: SavedResult, config: Config) -> InputConfig:
 def _begun(
     settings: RunSettings, driver: Driver, opened: Source, base: SavedResult | None
 ) -> TrackedVideo:
-    """A system for an opened source, calibrated; in the map of ``base`` if that is given."""
+    """Make a system for an opened source, calibrated; in the map of ``base`` if given."""
     config, progress, stop = settings.config, driver.progress, driver.stop
     source = self_calibrated(opened, config, driver.device, progress, stop)
     prior = open_prior(config.prior, source.camera, driver.device)
@@ -171,16 +171,16 @@ def resume(
     stop: Stop | None = None,
     observer: RunObserver | None = None,
 ) -> Result:
-    """Go on with the run whose checkpoint lies in a folder, as if nothing had happened.
+    """Resume the run whose checkpoint lies in a folder, with the same result.
 
-    ``settings`` are those it was begun with if none are given. Given ones may differ in what does
-    not decide about poses and map: the mesh, the number of the device, checkpoints, and what is
-    written besides; and in where files lie. What a checkpoint names is opened only if it is in the
-    folder, or the user made the checkpoint; else it has to be given.
+    ``settings`` default to those of the run. They may differ in settings that do not affect poses
+    and map: the mesh, the number of the device, checkpoints, additional files, and paths. Files
+    named by a checkpoint are opened only if they are in the folder, or the user made the
+    checkpoint; else they must be given.
 
     Raises:
         InputError: there is nothing to resume, or it cannot be used, or with other settings.
-        TrackingLost, OutputError, DeviceError: as of a run.
+        TrackingLost, OutputError, DeviceError: as for ``run``.
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     saved = SavedRun(output)
@@ -206,10 +206,10 @@ def resume(
 
 
 def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:
-    """Settings to go on with in a folder, on the kind of device that the run began on or the CPU.
+    """Settings to resume with in a folder, on the run's kind of device or the CPU.
 
     Raises:
-        InputError: they would compute something else, or elsewhere; files of the run are not named.
+        InputError: they change the result or the folder, or do not name the run's files.
     """
     missing = options_missing(settings, begun.settings)
     if missing:

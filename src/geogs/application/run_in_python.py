@@ -1,4 +1,4 @@
-"""A whole run as one call of a Python program."""
+"""A whole run as one function call."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,12 +19,12 @@ def run(
     *,
     progress: RunProgress | None = None,
 ) -> Result:
-    """All that ``geogs run`` does, files included; its result, without a word.
+    """Do all of ``geogs run``, with its files, silently. Returns the result.
 
     Args:
-        source: a video, a folder, a data set, a bag, or several of one place.
-        config: all settings; if none those of the preset ``default`` on the device.
-        output: folder of the result; out/NAME if none is given, as ``Result.folder`` says.
+        source: a video, a folder, a data set, a bag, or several of one scene.
+        config: all settings; the preset ``default`` for the device if none.
+        output: folder of the result; out/NAME if none is given, see ``Result.folder``.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
         progress: follows the work.
 

@@ -1,6 +1,6 @@
-"""What a run or a reconstruction is given: the same record for a command, a script, a checkpoint.
+"""Inputs and settings of a run or a reconstruction, for a command, a script and a checkpoint.
 
-Nothing here is imported but the settings, so that a command line can be read at once.
+This module imports only the settings, so that a command line can be read at once.
 """
 
 from dataclasses import dataclass, field, replace
@@ -61,11 +61,11 @@ class RunSettings(Settings):
     """Keep the images of the keyframes in keyframes/, which geogs mesh and geogs export use."""
 
     def absolute(self) -> "RunSettings":
-        """The same with paths that hold wherever the run is resumed from, and without a folder."""
+        """The same with absolute paths, and without an output folder."""
         return with_absolute_paths(replace(self, output=None))
 
     def deciding(self) -> "RunSettings":
-        """Only what decides about poses and map; all else has its default.
+        """Only the settings that affect poses and map; all others have their defaults.
 
         Two runs on the same kind of device that differ elsewhere compute the same.
         """
@@ -123,7 +123,7 @@ class LiveSettings(Settings):
 
 @dataclass(frozen=True)
 class Verbosity(Settings):
-    """What is said on the terminal, and in a file."""
+    """Verbosity on the terminal, and the log file."""
 
     verbose: Annotated[bool, Basic("-v")] = False
     """Say how long each phase took, and what else there is to know."""

@@ -1,4 +1,4 @@
-"""SLAM as Python programs use it: poses of a whole source, and a map to show, keep and load."""
+"""SLAM for Python programs: poses of a whole source, and a map to show, save and load."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -36,16 +36,16 @@ def track(
     device: str = "auto",
     slam: Slam | None = None,
 ) -> Iterator[PoseEstimate]:
-    """Where the camera is after each frame of a video, a folder, a camera or a stream.
+    """Yield the camera's pose after each frame of a video, a folder, a camera or a stream.
 
     Args:
-        source: what ``geogs.open_source`` opens, or has opened. Of a path, the focal length and the
-            readout of the shutter are found beforehand as ``geogs run`` does, if nobody says them
-            and no ``slam`` is given; what is opened already is taken as it is.
-        config: settings, also those of how the source is read.
+        source: path for ``geogs.open_source``, or an opened source. For a path, the focal length
+            and the readout of the shutter are estimated first as by ``geogs run``, if they are
+            not given and there is no ``slam``; an opened source is used unchanged.
+        config: settings, including those of reading the source.
         device: cpu, cuda, cuda:1, or auto for a GPU where there is one.
-        slam: to use instead of a new one, such as a loaded one; it can be asked meanwhile and
-            finished afterwards.
+        slam: system to use instead of a new one, such as a loaded one; it can be queried meanwhile
+            and finished afterwards.
 
     Raises:
         InputError: the source cannot be read, or is not of the camera of ``slam``.
@@ -66,10 +66,10 @@ def track(
 
 @on_one_torch_thread
 def go_on_in(slam: Slam, saved: SavedResult) -> None:
-    """Before the first frame: go on in a saved map, which stays where it is.
+    """Continue in a saved map, which stays fixed; to be called before the first frame.
 
-    The camera is looked for among its keyframes; what cannot be found there is a segment of its own
-    until loops join it. Trajectories are those of new frames.
+    The camera is localised among its keyframes; frames that cannot be form a segment of their own
+    until loops join it. Trajectories hold new frames only.
 
     Raises:
         InputError: there is no keyframe, one has no image, or one of another camera.
@@ -78,7 +78,7 @@ def go_on_in(slam: Slam, saved: SavedResult) -> None:
         raise InputError("A map with keyframes has to be given, and before the first frame.")
     segment = slam.segments.main.segment
     ids = add_saved_keyframes(segment, saved.keyframes)
-    segment.status.frames_lost = slam.config.tracking.patience  # nothing is to be waited for
+    segment.status.frames_lost = slam.config.tracking.patience  # no waiting period
     slam.loops.remember(ids)
     masks = {i: m for n, i in enumerate(ids) if (m := saved.image_mask(n)) is not None}
     with slam.stopwatch("mapping"):
@@ -92,14 +92,14 @@ def load_slam(
     live: bool = False,
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Slam:
-    """A system that goes on in a saved map, or the result of a run.
+    """Load a system that continues in a saved map, or in the result of a run.
 
-    The camera is that of the map. Its keyframes stay where they are; until an image is recognised
-    at one of them, or images form a map of their own that loops join to it, there are no poses.
-    Trajectories are those of new images alone.
+    The camera is that of the map. Its keyframes stay fixed; there are no poses until an image is
+    localised at one of them, or images form a map of their own that loops join to it.
+    Trajectories hold new images only.
 
     Raises:
-        InputError: there is no map, it is damaged, or was kept without keyframe images.
+        InputError: there is no map, it is damaged, or was saved without keyframe images.
     """
     saved = load_result(folder, require_device(device))
     slam = Slam(saved.camera, config, device, live=live, mask=mask)
@@ -109,10 +109,10 @@ def load_slam(
 
 @on_one_torch_thread
 def save_slam(slam: Slam, folder: str | Path) -> Path:
-    """Keep the map as it is now, to be loaded by :func:`load_slam` and ``geogs.load_result``.
+    """Save the present map for :func:`load_slam` and ``geogs.load_result``. Returns the folder.
 
-    Trajectory, camera, disks, and the keyframes' poses and images, in place of what an earlier
-    result in the folder had; returns the folder.
+    Writes trajectory, camera, disks, and the keyframes' poses and images; an earlier result in the
+    folder is replaced.
 
     Raises:
         InputError: there is no map yet.
@@ -135,6 +135,6 @@ def save_slam(slam: Slam, folder: str | Path) -> Path:
 
 
 def slam_mesh(slam: Slam) -> Mesh | None:
-    """The surface of the map as it is now; none where there is none yet."""
+    """The surface of the present map; none where there is none yet."""
     renders = slam.renders()
     return surface_of(renders, slam.config.mesh, RunProgress()) if len(renders) else None

@@ -1,4 +1,4 @@
-"""A video whose frames are tracked one by one, mapped, and checkpointed on the way."""
+"""A video whose frames are tracked one by one, mapped, with checkpoints on the way."""
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -23,37 +23,37 @@ from geogs.stopwatch import Stopwatch
 from geogs.types import Frame
 
 MIN_PREVIEW_KEYFRAMES = 20
-"""Keyframes from which map and mesh take so long on a CPU that there is a preview."""
+"""Least number of keyframes for a preview: map and mesh take long on a CPU then."""
 INTERRUPTED_SECONDS = 40.0
-"""Seconds for a map after an interruption, where there is none yet."""
+"""Time in seconds for a map after an interruption, where there is none yet."""
 
 
 @dataclass
 class TrackedVideo:
-    """A video whose frames are tracked one by one, by a system that has been made ready."""
+    """A video whose frames are tracked one by one, by a prepared system."""
 
     scene: Slam
     source: Source
-    """Calibrated."""
+    """The calibrated source."""
     frames: Generator[Frame, None, None]
-    """Frames that are left."""
+    """Remaining frames."""
     metadata: RunMetadata
     output: Path
 
     @property
     def way_on(self) -> str:
-        """The command that goes on from the last checkpoint."""
+        """The command that resumes from the last checkpoint."""
         on_cpu = ", with --device cpu on the CPU" if self.metadata.device != "cpu" else ""
         return f"geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
 
     def state(self) -> RunState | None:
-        """What a checkpoint holds; nothing of what cannot be gone on with."""
+        """The checkpoint record; none where the run cannot be resumed."""
         if self.metadata.settings.map is not None or self.source.is_live:
             return None
         return run_state(self.metadata, self.scene, self.source)
 
     def locate(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
-        """Poses: the frames that are left, then the adjustment of all keyframes.
+        """Estimate poses: track the remaining frames, then adjust all keyframes.
 
         Raises TrackingLost if no frame could be tracked.
         """
@@ -72,7 +72,7 @@ class TrackedVideo:
         return _finished(driver, outcome, lambda: self._adjust(driver, new))
 
     def map(self, driver: Driver, outcome: Outcome) -> Outcome:
-        """The map after :meth:`locate` came to ``outcome``: where it was cut short or this is, one
+        """Make the map after :meth:`locate` ended with ``outcome``; if either is interrupted, a map
         in little time."""
         slam, was_cut = self.scene, outcome is not Outcome.FINISHED
         if outcome is Outcome.FINISHED and slam.world.maps_at_end and not driver.kernels.is_working:
@@ -86,18 +86,18 @@ class TrackedVideo:
         return outcome
 
     def _track(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
-        """All frames through the system, until a request to stop."""
+        """Track all frames, until a request to stop."""
         stop = driver.stop
         try:
             if self.scene.world.is_ended:
-                next(self.frames, None)  # only what the source says of itself at its end
+                next(self.frames, None)  # only for the source's messages at its end
             else:
                 self._track_each(driver, checkpoint)
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
             driver.stop_early("The GPU has no memory left")
             return Outcome.MEMORY_FULL
-        if self.source.is_live and stop.requested:  # the usual end of what has none
+        if self.source.is_live and stop.requested:  # the usual end of a live source
             stop.requested = False
             driver.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
         if not stop.requested:
@@ -120,7 +120,7 @@ class TrackedVideo:
             checkpoint.write_if_due()
 
     def _refine(self, driver: Driver) -> None:
-        """The map; compiled is first what its depths need."""
+        """Make the map; the kernels of its depths are compiled first."""
         kernels = driver.kernels
         kernels.wait(driver.report, "search")
 
@@ -132,7 +132,7 @@ class TrackedVideo:
         self.scene.refine(report)
 
     def _write_preview(self, driver: Driver) -> None:
-        """A rough mesh for who would wait long for the other."""
+        """Write a rough mesh if the final one takes long."""
         slam = self.scene
         is_short = len(slam.segments.main.segment.ids) < MIN_PREVIEW_KEYFRAMES
         if is_short or slam.world.keyframes.grid.on_gpu:  # there the map is made in seconds
@@ -155,7 +155,7 @@ class TrackedVideo:
             self._write_stage("adjusted", driver, new)
 
     def _write_stage(self, name: Literal["online", "adjusted"], driver: Driver, new: Path) -> None:
-        """What there is by now, if it is asked for, and if there is a map."""
+        """Write intermediate results, if they are requested and there is a map."""
         if self.metadata.settings.online_results and not self.scene.world.maps_at_end:
             write_stage(new, self.scene, driver.progress, name)
 
@@ -171,9 +171,9 @@ def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:
 
 
 def _finished(driver: Driver, outcome: Outcome, stage: Callable[[], object]) -> Outcome:
-    """What the work comes to after a final stage, which is left out where it was cut short before.
+    """Do a final stage, unless work was cut short before. Returns the outcome.
 
-    Where the memory of the GPU is full, what there is by then is kept.
+    If the GPU's memory is full, the results so far are kept.
     """
     if outcome is not Outcome.FINISHED:
         return outcome

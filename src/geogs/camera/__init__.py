@@ -1,1 +1,1 @@
-"""The camera: how its lens bends, when its rows are seen, and images as a pinhole sees them."""
+"""The camera: lens distortion, rolling shutter, and straightening of images to a pinhole."""

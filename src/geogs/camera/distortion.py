@@ -1,8 +1,8 @@
-"""Lens distortion as OpenCV has it: from rays to the pixels of an image as it came, and back.
+"""OpenCV's lens distortion: from rays to the pixels of a distorted image, and back.
 
-A *polynomial* lens bends the plane z = 1 by k1, k2, p1, p2(, k3(, k4, k5, k6)). A *fisheye*
+A *polynomial* lens distorts the plane z = 1 by k1, k2, p1, p2(, k3(, k4, k5, k6)). A *fisheye*
 (Kannala and Brandt, "A generic camera model and calibration method for conventional, wide-angle,
-and fish-eye lenses", PAMI 2006) puts a ray at the angle a from its axis at the radius
+and fish-eye lenses", PAMI 2006) maps a ray at the angle a from its axis to the radius
 a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8); without coefficients the radius is the angle.
 """
 
@@ -18,15 +18,15 @@ from geogs.geometry.camera import Camera
 
 LensModel = Literal["polynomial", "fisheye"]
 USUAL_BEND = 0.1, 0.2
-"""Standard deviations of the k1 and k2 of a polynomial lens of which nothing is known."""
+"""Prior standard deviations of k1 and k2 of an uncalibrated polynomial lens."""
 RESAMPLING = cv2.INTER_LANCZOS4
-"""How images are straightened. OpenCV's cubic (a = -3/4, which does not keep a slope) would show
-things up to 0.04 pixels beside their place, most where that lies a quarter from a pixel, and rows
-that are read in turn run through all such places."""
+"""Interpolation of straightened images. OpenCV's cubic (a = -3/4, which does not preserve a slope)
+would shift image content by up to 0.04 pixels, most at a quarter of a pixel; the offsets of a
+rolling shutter's rows pass through all such fractions."""
 FISHEYE_LIMIT = np.radians(88.0)
-"""Angle from the axis beyond which the plane z = 1 is no use; rays that are farther end there."""
+"""Angle from the axis up to which the plane z = 1 is used; rays beyond are clamped to it."""
 _POLISHING = 8
-"""Corrections after OpenCV's own few, which leave errors that an image can show."""
+"""Corrections after OpenCV's own few, which leave visible errors."""
 _HALVINGS = 52
 _FITTING = 4
 """Steps of a fit of coefficients, most of which enter linearly."""
@@ -38,10 +38,10 @@ def distorted_pixels(
     distortion: Sequence[float],
     lens: LensModel = "polynomial",
 ) -> Float[np.ndarray, "n 2"]:
-    """Where rays x/z, y/z are seen in the image of a lens.
+    """Project rays x/z, y/z into the image of a lens.
 
-    ``camera`` is its pinhole part; ``distortion`` holds OpenCV's coefficients of the lens, none of
-    them for a pinhole or a fisheye whose radius is the angle.
+    ``camera`` is its pinhole part; ``distortion`` holds OpenCV's coefficients, none for a pinhole
+    or a fisheye whose radius is the angle.
     """
     if lens == "fisheye":
         radius = np.linalg.norm(rays, axis=1, keepdims=True)
@@ -62,9 +62,9 @@ def undistorted_rays(
     distortion: Sequence[float],
     lens: LensModel = "polynomial",
 ) -> Float[np.ndarray, "n 2"]:
-    """The rays x/z, y/z that pixels of a lens's image see: the inverse of the above.
+    """Return the rays x/z, y/z of pixels in the image of a lens: the inverse of the above.
 
-    Those of a fisheye that look farther than ``FISHEYE_LIMIT`` from its axis are given there.
+    Fisheye rays farther than ``FISHEYE_LIMIT`` from the axis are clamped to it.
     """
     plane = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     if lens == "fisheye":
@@ -84,7 +84,7 @@ def undistorted_rays(
 def lens_maps(
     target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
+    """Return column and row in the image of a lens for each pixel of a pinhole, float32."""
     K, target_K, size = source.K, target.K, (target.width, target.height)
     D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
     if lens == "fisheye":
@@ -102,12 +102,12 @@ def with_bend(
     factor: float = 1.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Camera, tuple[float, ...]]:
-    """A lens that bends rays by OpenCV's k1 and k2, shifts them, and stretches all that by a factor
-    before it does what it did: the camera, whose focal length is so many times larger and whose
-    principal point lies where the axis is seen, and the coefficients.
+    """Combine a lens with a correction applied before it: distort rays by OpenCV's k1 and k2
+    (``bend``), shift them, and scale all by ``factor``. Return the camera, with scaled focal length
+    and the principal point where the axis is seen, and the coefficients.
 
-    As many as there are of it, of a pinhole four: those that put the rays that the image sees
-    where both in turn do, by least squares (exactly for a pinhole). Source: Gauss-Newton.
+    There are as many as before, four for a pinhole, fitted to both mappings in turn over the rays
+    of the image by least squares (exact for a pinhole). Source: Gauss-Newton.
     """
     v, u = (x.reshape(-1) for x in np.mgrid[: camera.height : 16j, : camera.width : 16j])
     rays = undistorted_rays(np.stack([u, v], 1), camera, distortion, lens) / factor - shift
@@ -129,7 +129,7 @@ def with_bend(
 
 
 def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
-    """The radius at which a fisheye shows an angle, of focal length 1."""
+    """Return the radius of an angle in a fisheye image of focal length 1."""
     square, factor = angle**2, np.zeros_like(angle)
     for k in reversed(coefficients):
         factor = square * (k + factor)
@@ -137,9 +137,9 @@ def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
 
 
 def _straight(radius: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
-    """The angle that a fisheye shows at a radius, up to the limit or where the radius turns back.
+    """Return the angle of a radius in a fisheye image, up to the limit or where the radius falls.
 
-    By halving, which is safe whatever the coefficients are.
+    By bisection, which is safe for any coefficients.
     """
     angles = np.linspace(0.0, FISHEYE_LIMIT, 1000)
     falls = np.flatnonzero(np.diff(_bent(angles, coefficients)) <= 0)

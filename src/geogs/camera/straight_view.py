@@ -1,4 +1,4 @@
-"""Pixels that a found lens shows, and those of the pinhole that it was taken for."""
+"""Mapping between the pixels of an estimated lens and those of the pinhole assumed before."""
 
 import math
 from collections.abc import Mapping
@@ -16,20 +16,20 @@ from geogs.geometry.camera import Camera
 from geogs.types import FoundLens, FrameLens
 
 SAME = 1e-3
-"""Pixels by which one that comes back from the lens may be another."""
+"""Largest round-trip error through the lens, in pixels, at which a pixel counts as shown."""
 
 
 @dataclass(frozen=True)
 class StraightView:
-    """A pinhole, and the lens that saw in its place."""
+    """A pinhole, and the lens that took its images."""
 
     camera: Camera
-    """The pinhole."""
+    """The assumed pinhole."""
     lens: FoundLens
 
     @staticmethod
     def of_pinhole(camera: Camera) -> "StraightView":
-        """The view of images that are straight already."""
+        """Return the view of images without distortion."""
         return StraightView(camera, FoundLens(0.0, 0.0, 0.0, 0.0))
 
     @cached_property
@@ -44,18 +44,18 @@ class StraightView:
         return self.lens.k1, self.lens.k2, 0.0, 0.0
 
     def of_frame(self, own: FrameLens) -> "StraightView":
-        """The view of a frame whose lens has something of its own."""
+        """Return the view of a frame with intrinsics of its own."""
         return replace(self, lens=self.lens.of_frame(own))
 
     # --- points ----------------------------------------------------------------------------
 
     def bent(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-        """Where the lens shows what the pinhole shows at some pixels."""
+        """Map pixels of the pinhole to pixels of the lens."""
         return self.seen_by.pixels(self.camera.plane(pixels.double())).to(pixels)
 
     def straight(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-        """Where the pinhole shows what the lens shows at some pixels; NaN where it shows nothing,
-        as beyond where a polynomial turns back."""
+        """Map pixels of the lens to pixels of the pinhole; NaN where the lens shows nothing, as
+        beyond the maximum of a polynomial's radius."""
         plane = self.seen_by.plane(pixels.double())
         is_shown = (self.seen_by.pixels(plane) - pixels).norm(dim=-1, keepdim=True) < SAME
         return torch.where(is_shown, self.camera.pixels(plane), torch.nan).to(pixels)
@@ -63,21 +63,21 @@ class StraightView:
     # --- images ----------------------------------------------------------------------------
 
     def image(self, bent: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """The image that the pinhole sees. What is beyond the border gets its colour; what was
-        masked out stays black."""
+        """Straighten an image. Pixels beyond the border get its colour; masked-out pixels stay
+        black."""
         straight = cv2.remap(bent, *self._maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
-        black = bent[..., 0] | bent[..., 1] | bent[..., 2]  # one after the other: quicker
+        black = bent[..., 0] | bent[..., 1] | bent[..., 2]  # faster than a reduction
         straight[self.nearest(black) == 0] = 0
         return straight
 
     def nearest(self, bent: Shaped[np.ndarray, "h w *c"]) -> Shaped[np.ndarray, "h w *c"]:
-        """Values of the pixels that the lens saw, the nearest ones beyond its border."""
+        """Straighten by nearest neighbours; beyond the border the nearest pixels count."""
         row, column = self._nearest
         return bent[row, column]
 
     @cached_property
     def is_seen(self) -> Bool[np.ndarray, "h w"]:
-        """Which pixels of the pinhole the lens saw."""
+        """Whether the lens saw each pixel of the pinhole."""
         u, v = self._maps
         width, height = self.camera.width, self.camera.height
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
@@ -94,22 +94,22 @@ class StraightView:
 
 @dataclass(frozen=True)
 class FrameViews:
-    """How frames of a video are straightened, whose lenses may have something of their own."""
+    """Views of the frames of a video, whose intrinsics may vary."""
 
     view: StraightView
-    """By the lens of all."""
+    """View of the shared lens."""
     own: Mapping[int, FrameLens] = field(default_factory=dict)
-    """By the indices of the frames."""
+    """Per-frame intrinsics by the indices of the frames."""
 
     def of(self, frame: int) -> StraightView:
-        """That of a frame."""
+        """Return the view of a frame."""
         own = self.own.get(frame)
         return self.view if own is None else self.view.of_frame(own)
 
     def alike(self, frame: int, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """The image of a frame as the lens of all saw it: what its own has beside that taken off.
+        """Warp the image of a frame to the shared lens, to remove its per-frame intrinsics.
 
-        What is beyond the border gets its colour.
+        Pixels beyond the border get its colour.
         """
         if frame not in self.own:
             return image

@@ -1,4 +1,4 @@
-"""What could stand for an unfinished word of a command line, for the Tab key of a shell."""
+"""Completions of an unfinished word of a command line, for the Tab key of a shell."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -7,17 +7,17 @@ from geogs.config.leaves import Leaf
 from geogs.config.setting import Positional, dashed
 
 ASKED = "--complete"
-"""Last of the arguments where a shell asks."""
+"""Last argument of a completion request from a shell."""
 
 
 def matching(found: Mapping[str, str], unfinished: str) -> str:
-    """Lines for a shell: what begins like the unfinished word, and what it is."""
+    """Lines for a shell: completions of the unfinished word, with their descriptions."""
     named = [(name, text) for name, text in found.items() if name.startswith(unfinished)]
     return "\n".join(f"{name}\t{text}" if text else name for name, text in named)
 
 
 def candidates(known: Sequence[Leaf], typed: Sequence[str]) -> dict[str, str]:
-    """What could stand for the last of the words typed, and what each of them is."""
+    """Possible completions of the last typed word, with their descriptions."""
     *before, unfinished = typed or [""]
     taking = {name: leaf for leaf in known if leaf.kind.base is not bool for name in leaf.options}
     last = taking.get(dashed(before[-1])) if before else None

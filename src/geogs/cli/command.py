@@ -1,7 +1,7 @@
-"""Sub-commands of ``geogs``: its own, and those that packages beside it register.
+"""Sub-commands of ``geogs``: its own, and those registered by other packages.
 
 A package registers a command by an entry point in the group ``geogs.commands`` that leads to a
-:class:`Command`. What that is in is imported for ``geogs --help`` and has to be light.
+:class:`Command`. Its module is imported for ``geogs --help`` and must be light.
 """
 
 import importlib
@@ -22,7 +22,7 @@ class Command:
     help: str
 
     def run(self, argv: Sequence[str]) -> int:
-        """Run it; returns the exit code."""
+        """Run the command; returns the exit code."""
         code: int = importlib.import_module(self.module).main(argv)
         return code
 
@@ -48,7 +48,7 @@ COMMANDS = {
 
 
 def all_commands() -> dict[str, Command]:
-    """Every command by name: those of this package, then those that others register."""
+    """Every command by name: those of this package, then those of other packages."""
     from importlib.metadata import entry_points
 
     others = {point.name: point for point in entry_points(group=GROUP)}

@@ -1,9 +1,9 @@
 """``geogs completion SHELL``: the Tab key completes commands, options and their values.
 
-A shell is given a few lines that ask the command itself, so that they are never out of date: the
-words typed so far, the last one unfinished, and ``--complete`` behind them. What could stand for
-the last one is printed a line each, with a tabulator and a few words after it where there is
-something to say. Nothing printed means a file.
+A shell gets a short script that calls the command itself, so that it is never out of date, with the
+words typed so far, the last one unfinished, and ``--complete`` after them. Completions of the last
+word are printed one per line, with a tab and a description where there is one. No output means a
+file.
 """
 
 from collections.abc import Sequence

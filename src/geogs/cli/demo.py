@@ -1,4 +1,4 @@
-"""``geogs demo``: make a small room, reconstruct it as any other video, show the errors."""
+"""``geogs demo``: make a small room, reconstruct it like any video, show the errors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def demo(options: DemoOptions) -> int:
-    """The three commands one after the other; kernels of the second are compiled from the first."""
+    """Run the three commands in turn; the second one's kernels are compiled during the first."""
     from geogs.application.machine.compilation import compiling
     from geogs.gpu.installation import require_device
 

@@ -1,4 +1,4 @@
-"""``geogs doctor``: what this machine can do, and what to mend."""
+"""``geogs doctor``: diagnosis of this machine, and problems to fix."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def listing() -> str:
-    """The sequences that are known, with their licences."""
+    """List of the known sequences, with their licences."""
     width = max(len(sequence.name) for sequence in SEQUENCES)
     lines = [f"  {s.name:<{width}}  {s.licence:<16} {s.page}" for s in SEQUENCES]
     return "\n".join(["geogs download NAME DIR, of", *lines])

@@ -1,4 +1,4 @@
-"""What ``--help`` and ``--help-all`` print, from the types and the words of the options."""
+"""Text of ``--help`` and ``--help-all``, from the types and docstrings of the options."""
 
 import inspect
 import re
@@ -14,7 +14,7 @@ _COLUMN = 28
 
 
 def help_text(options: type, command: str, everything: bool) -> str:
-    """The help of a command: all of its options, or those that most need."""
+    """The help of a command: all of its options, or the common ones."""
     width = min(100, shutil.get_terminal_size().columns)
     known = leaves(options, command)
     places = [leaf for leaf in known if leaf.mark(Positional) is not None]
@@ -37,12 +37,12 @@ def help_text(options: type, command: str, everything: bool) -> str:
 
 
 def is_shown_first(leaf: Leaf) -> bool:
-    """Whether ``--help`` shows an option, and not ``--help-all`` alone."""
+    """Whether ``--help`` shows an option, not only ``--help-all``."""
     return not leaf.group or leaf.mark(Basic) is not None
 
 
 def first_clause(text: str) -> str:
-    """What a text says before its first colon, semicolon or full stop."""
+    """Part of a text before its first colon, semicolon or full stop."""
     return text[:1] + re.split(r"[:;.]", text[1:])[0]
 
 
@@ -52,7 +52,7 @@ def _place(leaf: Leaf) -> str:
 
 
 def _head(leaf: Leaf) -> str:
-    """Names of an option and what its value is."""
+    """Names of an option and the type of its value."""
     kind = leaf.kind
     if kind.base is bool:
         switch = leaf.switch_off.replace("no-", "[no-]", 1)

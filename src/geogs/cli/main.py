@@ -18,17 +18,17 @@ from geogs.errors import GeogsError
 from geogs.version import __version__
 
 EXIT_ERROR = 2
-"""Exit code after an error that the user can mend."""
+"""Exit code after an error that the user can fix."""
 EXIT_INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells give it (128 + SIGINT)."""
+"""Exit code after Ctrl-C, as in shells (128 + SIGINT)."""
 _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN error", "NVRTC")
-"""What errors of PyTorch begin with that no command has said in its own words."""
+"""Beginnings of PyTorch's errors that no command has translated."""
 _UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EIO, errno.ESTALE, errno.EROFS)
-"""What systems say of paths, at the first look at them."""
+"""System errors for unusable paths."""
 _MIN_MEMORY = 1 << 30
-"""Bytes of addresses without which what is imported ends the process in words of its own."""
+"""Least address space in bytes; below it, native imports abort the process."""
 _LONG_WORD = re.compile(r"(\S{80})\S{100,}(\S{80})")
-"""A word that is shown by both of its ends, such as a path put together by mistake."""
+"""A word that is shortened to both of its ends, such as a wrongly joined path."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,7 +65,7 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def help_text() -> str:
-    """What ``geogs --help`` prints."""
+    """Text of ``geogs --help``."""
     commands = all_commands()
     width = max(map(len, commands))
     rows = [f"  {name:<{width}}  {command.help}" for name, command in commands.items()]
@@ -90,13 +90,13 @@ def print_error(sentence: str) -> None:
 
 
 def _guarded(run: Callable[[], int]) -> int:
-    """Run a command; errors that a user can mend become one line and an exit code.
+    """Run a command; errors that a user can fix become one line and an exit code.
 
     Others keep their traceback, and with ``GEOGS_DEBUG=1`` all do.
     """
     try:
         code = run()
-        sys.stdout.flush()  # a reader that has gone is noticed here rather than at exit
+        sys.stdout.flush()  # detects a closed pipe here rather than at exit
         return code
     except SystemExit as stop:  # help and wrong options end this way
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_ERROR
@@ -112,7 +112,7 @@ def _guarded(run: Callable[[], int]) -> int:
 
 
 def _resource_error(error: Exception) -> str | None:
-    """What to say where the system gave too little; nothing for other errors, which are bugs."""
+    """Message for a lack of system resources; none for other errors, which are bugs."""
     said = str(error)
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
         return "Too many files are open; raise the limit (ulimit -n)."
@@ -124,11 +124,11 @@ def _resource_error(error: Exception) -> str | None:
     if type(error).__name__ == "OutOfMemoryError" or said.startswith(_GPU_FAILS):
         first = said.splitlines()[0][:200].rstrip(".") if said else "out of memory"
         return f"The GPU failed ({first}); --device cpu computes without it."
-    if "no locator available" in said:  # numba's words
+    if "no locator available" in said:  # numba's message
         return "No folder can be written for compiled kernels; name one by NUMBA_CACHE_DIR."
     lacks = ("allocate memory", "start new thread", "failed to map segment", "Insufficient memory")
     is_told = isinstance(error, MemoryError) or any(words in said for words in lacks)
-    # Libraries that cannot be loaded say so each in its own way.
+    # Libraries that cannot be loaded report it in different ways.
     is_unloaded = isinstance(error, ImportError | OSError) and getattr(error, "errno", None) is None
     if is_told or (is_unloaded and _memory_limit() < math.inf):
         return (
@@ -139,7 +139,7 @@ def _resource_error(error: Exception) -> str | None:
 
 
 def _memory_limit() -> float:
-    """Bytes of addresses that the process may use."""
+    """Address space limit of the process in bytes."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     return math.inf if limit == resource.RLIM_INFINITY else limit
 

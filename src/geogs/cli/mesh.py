@@ -1,4 +1,4 @@
-"""``geogs mesh OUT``: the mesh of a result anew, without running again."""
+"""``geogs mesh OUT``: extract the mesh of a result again, without another run."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _defaults(given: Given) -> RemeshSettings:
-    """The settings that the result was made with."""
+    """The settings of the result."""
     from geogs.application.results.remesh import mesh_settings
 
     folder = Path(given["result"])

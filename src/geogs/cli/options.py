@@ -1,4 +1,4 @@
-"""Command-line options from a dataclass, for every sub-command alike.
+"""Command-line options from a dataclass, the same way for every sub-command.
 
 Settings are read, checked and explained from their types alone (:mod:`geogs.config.setting`).
 Nested dataclasses become dotted options (``--input.stride 2``); hyphens and underscores are the
@@ -21,7 +21,7 @@ from geogs.errors import InputError
 Options = TypeVar("Options")
 Record = TypeVar("Record")
 Given = Mapping[str, str]
-"""What the arguments say, by the dotted name of the option; switches say on or off."""
+"""Given values as text, by the dotted name of the option; switches are on or off."""
 
 
 def parse_options(
@@ -36,7 +36,7 @@ def parse_options(
         options: the dataclass; its docstring and those of its fields are the help.
         argv: arguments after the name of the sub-command.
         command: the name of the sub-command.
-        default: makes the options that hold where nothing is given, from what is given.
+        default: makes the default options, depending on the given ones.
 
     Raises:
         InputError: an option is unknown, wrong or missing.
@@ -67,14 +67,14 @@ def parse_options(
 
 
 def record(kind: type[Record], options: object) -> Record:
-    """The plain record that options of a command are more than."""
+    """The plain record within the options of a command."""
     return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # type: ignore[arg-type]
 
 
 def _say_what_is_asked(
     options: type, known: Sequence[Leaf], argv: Sequence[str], command: str
 ) -> None:
-    """Help, or what completes a word, where that is all that is wanted; then SystemExit."""
+    """Print help or completions if they are requested; then SystemExit."""
     everything = "--help-all" in argv
     if argv and argv[-1] == ASKED:
         print(matching(candidates(known, argv[:-1]), argv[-2] if argv[:-1] else ""))
@@ -88,7 +88,7 @@ def _say_what_is_asked(
 def _named(
     known: Sequence[Leaf], argv: Sequence[str], command: str
 ) -> tuple[list[str], dict[str, list[str]]]:
-    """Words that belong to no option, and those that do by the dotted name of the option."""
+    """Positional words, and the values of options by their dotted names."""
     names = {name: leaf for leaf in known for name in leaf.options}
     switches = {
         name: (leaf, text)
@@ -129,7 +129,7 @@ def _is_needed(leaf: Leaf, given: Mapping[str, object]) -> bool:
 
 
 def _value(leaf: Leaf, texts: list[str]) -> object:
-    """The value that an option was given. Raises InputError if it cannot have that."""
+    """Parse the value of an option. Raises InputError if it is not allowed."""
     kind = leaf.kind
     if kind.base is bool:
         return texts[-1] == "on"
@@ -143,7 +143,7 @@ def _value(leaf: Leaf, texts: list[str]) -> object:
 def _made(
     options: type, default: Any, values: Mapping[tuple[str, ...], object], path: tuple[str, ...]
 ) -> Any:
-    """An instance with some values of its settings, by their paths; the others are the default's.
+    """Make an instance with given values, by their paths; the others are the default's.
 
     Every group is made once, with all of its values.
     """

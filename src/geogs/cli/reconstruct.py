@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def parse(argv: Sequence[str]) -> ReconstructOptions:
-    """Options with the preset as defaults, over which single settings win.
+    """Parse options; the preset gives the defaults, and single settings override it.
 
     Raises:
         SystemExit: after ``--help``.
@@ -57,7 +57,7 @@ def parse(argv: Sequence[str]) -> ReconstructOptions:
 
 
 def _defaults(given: Given) -> ReconstructOptions:
-    """The preset asked for, else the one that suits the device."""
+    """The given preset, else the one for the device."""
     asked = given.get("preset")
     if asked is None:
         asked = "accurate" if is_gpu(given.get("device", "auto")) else "default"

@@ -42,7 +42,7 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
 
 
 def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
-    """Run the command, with what compiles ``kernels`` already; returns the exit code."""
+    """Run the command; ``kernels`` is a running compilation. Returns the exit code."""
     options = parse(argv)
     is_live = any(live_address(source) is not None for source in options.source)
     if options.offline and is_live:
@@ -71,7 +71,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
 
 
 def _observer(options: LiveSettings) -> "RunObserver | None":
-    """Who looks on, if somebody should."""
+    """Viewer and recorder, if requested."""
     from geogs.application.viewer.observer import Observers
 
     several: list[RunObserver] = []
@@ -90,18 +90,18 @@ def _observer(options: LiveSettings) -> "RunObserver | None":
 
 
 def parse(argv: Sequence[str]) -> RunOptions:
-    """Options over those of a preset, or over those of the run that is gone on with.
+    """Parse options; defaults are those of a preset, or of the run to resume.
 
     Raises:
         SystemExit: after ``--help``.
-        InputError: an option is wrong or missing; there is nothing to resume, or a preset is asked
-            for beside it.
+        InputError: an option is wrong or missing; there is nothing to resume, or a preset is given
+            with ``--resume``.
     """
     return parse_options(RunOptions, argv, "run", _defaults)
 
 
 def _defaults(given: Given) -> RunOptions:
-    """The preset asked for, or what the run that is gone on with was begun with."""
+    """Options of the given preset, or of the run to resume."""
     if "resume" not in given:
         name = cast(Preset, given.get("preset", "default"))
         is_live = live_address(Path(given.get("source", ""))) is not None

@@ -1,4 +1,4 @@
-"""``geogs scale OUT --from …``: a result in metres, without running again."""
+"""``geogs scale OUT --from …``: convert a result to metres, without another run."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""``geogs weights``: which weights files there are, and whether a file is intact."""
+"""``geogs weights``: list of the weights files, and check of a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def listing() -> str:
-    """What is known of every file, and where those are that were found."""
+    """List of all known files, with the paths of those found."""
 
     def entry(known: KnownWeights) -> list[str]:
         path = locate(known)
@@ -79,7 +79,7 @@ def listing() -> str:
 
 
 def verification(path: Path) -> str:
-    """What a file holds, and whether it is the published one of its name.
+    """Content of a file, and whether it is the published one of its name.
 
     Raises InputError if it is missing, damaged or another.
     """

@@ -1,4 +1,4 @@
-"""How a source is read."""
+"""Settings of reading a source."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from geogs.config.setting import Basic, NamesFile, Only, Range, Settings
 
 @dataclass(frozen=True)
 class InputConfig(Settings, group="input"):
-    """How the source is read."""
+    """Reading of the source."""
 
     intrinsics: Annotated[str, NamesFile(("auto",)), Basic("--intrinsics")] = "auto"
     """auto, a file, fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image, or

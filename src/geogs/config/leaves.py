@@ -63,7 +63,7 @@ class Leaf:
         return only is None or only.command == command
 
     def mark(self, kind: type) -> Any:
-        """What its type says of it, such as :class:`Basic`; none if it does not."""
+        """Mark in its type, such as :class:`Basic`; none if it does not."""
         return next((mark for mark in self.kind.marks if isinstance(mark, kind)), None)
 
 
@@ -96,7 +96,7 @@ def default_text(leaf: Leaf) -> str:
 
 
 def default_of(field: Any) -> Any:
-    """What a field is if it is not given; ``MISSING`` if it must be."""
+    """Default of a field; ``MISSING`` if it must be given."""
     return field.default if field.default_factory is MISSING else field.default_factory()
 
 

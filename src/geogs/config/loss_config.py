@@ -26,11 +26,11 @@ class LossConfig(Settings, group="mapping.loss"):
     depth_weight: Weight = 0.15
     """L_d, rendered depth against the keyframe's depth."""
     edge_factor: Weight = 10.0
-    """How much more L_d weighs near jumps of the keyframe's depth, where disks end."""
+    """Factor on the weight of L_d near jumps of the keyframe's depth, where disks end."""
     edge_reach: CountOrZero = 3
     """Pixels of the render around such a jump that are near it."""
     measured_factor: Annotated[Weight, Only("run")] = 13.0
-    """How much more L_d weighs in keyframes whose depth a sensor measured."""
+    """Factor on the weight of L_d in keyframes whose depth a sensor measured."""
     normal_weight: Annotated[Weight, Only("run")] = 0.05
     """L_n, rendered normal against a monocular prior's where there is one."""
     normal_consistency_weight: Weight = 0.05

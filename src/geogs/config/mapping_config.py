@@ -24,7 +24,7 @@ FINAL_STEPS = 600, 3000
 
 @dataclass(frozen=True)
 class DiskConfig(Settings, group="mapping.disk"):
-    """Where disks are made, how they start and when they go. Lengths in units of the map's depth.
+    """Creation, start and removal of disks. Lengths in units of the map's depth.
 
     The unit u is the median depth of the first keyframe.
     """
@@ -62,7 +62,7 @@ class DiskConfig(Settings, group="mapping.disk"):
 
 @dataclass(frozen=True)
 class PhotoConfig(Settings, group="mapping.photo"):
-    """Which keyframes check each other's depth by their images (L_mv)."""
+    """Choice of the keyframes that check each other's depth by their images (L_mv)."""
 
     max_view_angle: Angle = 35.0
     """Largest angle between the optical axes, degrees."""
@@ -82,9 +82,9 @@ class DepthConfig(Settings, group="mapping.depth"):
     """Dense depth of a keyframe before any disk is made."""
 
     engine: Literal["auto", "classical", "network", "joint", "tracker"] = "auto"
-    """Who finds depth: matching without a network, the network of geogs train depth, both, each
-    where it is more confident (auto on a GPU; on a CPU that is classical), or nobody: the tracker's
-    own depth, enlarged, as the paper has it."""
+    """Depth estimator: classical matching, the network of geogs train depth, joint (both, each
+    where it is more confident), or tracker, whose own depth is enlarged, as in the paper. auto is
+    joint on a GPU, classical on a CPU."""
     weights: Annotated[str, NamesFile()] = ""
     """Weights file of the network; "" takes the one that is found."""
     planes: Annotated[int, Range(2, 256)] = 144
@@ -106,8 +106,8 @@ class MapAblation(Settings, group="mapping.ablation"):
     at sparse points as in the paper's runs on DTU: those of the data set, or of features of its
     images."""
     map_update: Annotated[Literal["blended", "coherent", "per_keyframe"], Only("run")] = "blended"
-    """How the map follows a correction of the poses: each disk with all keyframes that see it in
-    place, all by one similarity (the paper's), or each with the keyframe that made it."""
+    """Motion of the map with a correction of the poses: each disk with all keyframes that see it,
+    all by one similarity (the paper's), or each with the keyframe that made it."""
 
 
 @dataclass(frozen=True)

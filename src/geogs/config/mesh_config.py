@@ -22,10 +22,10 @@ class MeshConfig(Settings, group="mesh"):
     """Triangles that a chosen voxel size aims at, to about 20 %, before those that the surface does
     not need are merged."""
     detail: Annotated[float, Range(0, 16), Basic()] = 1.0
-    """How far triangles may be merged: 99 % of the surface moves by less, and on average by less
+    """Tolerance of merging triangles: 99 % of the surface moves by less, and on average by less
     than 0.15 of it; voxels, 0 merges none."""
     smoothing: Annotated[float, Range(0, 16)] = 0.5
-    """How far vertices of merged triangles may move to make nearly parallel facets more so;
+    """Most that vertices of merged triangles may move to make nearly parallel facets parallel;
     voxels, 0 leaves them as they are."""
     memory_limit: Annotated[float, Range(1e-3, 1e6)] = 2.0
     """Most memory for the volume in GiB."""

@@ -44,11 +44,11 @@ class PriorConfig(Settings, group="prior"):
     model: Annotated[str, NamesFile(), Basic()] = ""
     """Network for depth (or depth and normals): a file; none does without."""
     card: Annotated[str, NamesFile(), Basic()] = ""
-    """What it wants and gives: the name of a card that comes with geogs, or a YAML file."""
+    """Card of its input and output: the name of one that comes with geogs, or a YAML file."""
     normal_model: Annotated[str, NamesFile()] = ""
     """Another network for normals, where the first has none: a file."""
     normal_card: Annotated[str, NamesFile()] = ""
-    """What that one wants and gives."""
+    """Card of that network."""
     scale_rows: Annotated[int, Range(2, 64)] = 8
     """Nodes of the scale field from top to bottom."""
     scale_columns: Annotated[int, Range(2, 64)] = 10
@@ -57,4 +57,4 @@ class PriorConfig(Settings, group="prior"):
     """Relative difference that is usual between neighbouring nodes."""
     reject: bool = True
     """Leave out what contradicts the matches, cells and whole keyframes, and trust the rest by how
-    well it agrees; off believes every prior everywhere alike, as HI-SLAM2 does."""
+    well it agrees; off trusts every prior everywhere alike, as HI-SLAM2 does."""

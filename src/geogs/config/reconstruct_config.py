@@ -15,7 +15,7 @@ from geogs.config.setting import Basic, Count, Range, Settings
 
 @dataclass(frozen=True)
 class SearchConfig(Settings, group="search"):
-    """How much is done for a map from known poses, and where depth is looked for."""
+    """Effort for a map from known poses, and the search for depth."""
 
     steps_per_view: Annotated[Count, Basic()] = 30
     """Training steps for every image where no time is given."""

@@ -49,7 +49,7 @@ def preset_of(config: Config) -> Preset:
 
 
 def _values(settings: Settings) -> list[object]:
-    """Of all settings of a group and the groups in it, in their order."""
+    """All settings of a group and the groups in it, in their order."""
     found = list[object]()
     for value in vars(settings).values():
         found += _values(value) if isinstance(value, Settings) else [value]

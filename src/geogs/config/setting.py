@@ -1,4 +1,4 @@
-"""What a setting may be: its kind and its range stand in its type and are checked at its making.
+"""Kinds of settings: kind and range stand in the type of each and are checked when it is made.
 
     @dataclass(frozen=True)
     class SweepConfig(Settings, group="mapping.sweep"):
@@ -124,7 +124,7 @@ Angle = Annotated[float, Range(0, 180)]
 """Degrees."""
 Weight = Annotated[float, Range(0, 1e6)]
 Positive = Annotated[float, Range(1e-9, 1e6)]
-"""What may divide: not so small that squares and single precision take it for 0."""
+"""A divisor: not so small that squares and single precision take it for 0."""
 Count = Annotated[int, Range(1, 1_000_000)]
 Port = Annotated[int, Range(1, 65535)]
 CountOrZero = Annotated[int, Range(0, 1_000_000)]
@@ -133,7 +133,7 @@ CountOrZero = Annotated[int, Range(0, 1_000_000)]
 
 @dataclass(frozen=True)
 class Kind:
-    """What values a setting takes."""
+    """Values that a setting takes."""
 
     base: type
     """bool, int, float, str or Path."""
@@ -141,13 +141,13 @@ class Kind:
     is_optional: bool = False
     """Whether it can be none."""
     word: str = ""
-    """What may stand instead of a number, such as auto."""
+    """Word that may stand instead of a number, such as auto."""
     is_tuple: bool = False
     """Whether it is any number of such values."""
     range: Range = Range()
-    """Which numbers."""
+    """Range of the numbers."""
     marks: tuple[object, ...] = ()
-    """What else the type says of it, such as :class:`Basic`."""
+    """Other marks in the type, such as :class:`Basic`."""
 
     @staticmethod
     def of(annotation: Any, marks: tuple[object, ...] = ()) -> "Kind":

@@ -17,9 +17,9 @@ from geogs.config.setting import (
 
 @dataclass(frozen=True)
 class CalibrationConfig(Settings, group="calibration"):
-    """How intrinsics that nobody gave are found from the video itself.
+    """Self-calibration from the video, where intrinsics are not given.
 
-    Intrinsics that the user or a data set gives stay before the run, and at its end unless all
+    Given intrinsics stay fixed before the run. The final adjustment changes them only if all
     matches, and both halves of the video, clearly contradict them.
     """
 
@@ -40,10 +40,10 @@ class TrackingConfig(Settings, group="tracking"):
     operator: Annotated[Literal["auto", "classical", "own", "droid", "droid_if_found"], Basic()] = (
         "auto"
     )
-    """What measures image motion; auto takes classical, which needs no weights; droid_if_found
+    """Estimator of image motion; auto takes classical, which needs no weights; droid_if_found
     takes droid, or classical where it finds no droid.pth."""
     weights: Annotated[str, NamesFile(), Basic()] = ""
-    """File with the operator's weights; empty looks for one (geogs weights says where)."""
+    """File with the operator's weights; empty searches for one (geogs weights shows where)."""
     keyframe_parallax: Fraction = 0.018
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge,
     without what the camera's rotation alone does; before depths are known, 1.4 times that in
@@ -75,13 +75,13 @@ class TrackingConfig(Settings, group="tracking"):
 
 @dataclass(frozen=True)
 class LoopConfig(Settings, group="loop"):
-    """Where loops are looked for and how many are kept.
+    """Search for loops, and the number of them that is kept.
 
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
     enabled: Annotated[bool, Basic()] = True
-    """Look for loops, close them, and recognise places when the camera is lost."""
+    """Search for loops and close them, and recognise keyframes when the camera is lost."""
     min_gap: Count = 15
     """Keyframes that lie at least between the two views of a loop."""
     appearance: CountOrZero = 5

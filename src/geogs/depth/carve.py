@@ -26,7 +26,7 @@ def look_up(
     depth: KeyframeDepth,
     camera: Camera,
 ) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Each point's z over the view's depth there, and the view's confidence; 0, 0 where unseen.
+    """Ratio of each point's z to the view's depth there, and its confidence; 0, 0 where unseen.
 
     ``T_view`` takes the frame of the points to the view's camera. Finite input only.
     """
@@ -66,8 +66,8 @@ def vote(
     views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
 ) -> Bool[np.ndarray, "n"]:
-    """World points to keep: the finite ones, but for those that at least ``VOTE_FREE_VIEWS`` views,
-    and more views than support them, see in free space.
+    """Whether to keep world points: the finite ones, except those that at least ``VOTE_FREE_VIEWS``
+    views, and more views than support them, see in free space.
     """
     finite = np.isfinite(points).all(1)
     surface, free = count_votes(points[finite], views, camera)

@@ -21,7 +21,7 @@ _FEW_VIEWS = 128
 
 
 class CpuDepthEngine:
-    """The compiled loops; keyframes, and the rows of each, are processed in parallel."""
+    """Depth engine of compiled loops; keyframes, and the rows of each, run in parallel."""
 
     def __init__(self, render: Camera, working: Camera, planes: int) -> None:
         """``planes`` is the largest number of planes of a sweep."""
@@ -69,7 +69,7 @@ class CpuDepthEngine:
         if 0 < len(depths) <= _FEW_VIEWS:
             depths = list(depths)
             poses = torch.from_numpy(np.stack([d.T_cw for d in depths]))
-            # No view has a say on the others, which may be most of a large map.
+            # No view votes on the others, which may be most of a large map.
             seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
         kept = torch.ones_like(seen)
         views = ((d.T_cw, d.depth.through_sky().arrays()) for d in depths)

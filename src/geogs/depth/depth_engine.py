@@ -1,4 +1,4 @@
-"""What the mapper needs of an engine that finds keyframe depths."""
+"""Interface of the estimators of keyframe depths that the mapper uses."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -21,9 +21,9 @@ class DepthTask(NamedTuple):
 
     view: DepthView
     neighbours: Sequence[DepthView]
-    """What it is matched with, best first."""
+    """Views that it is matched with, best first."""
     limits: Limits | None = None
-    """Nearest and farthest depth to search; none leaves them to the tracker."""
+    """Nearest and farthest depth to search; None for those of the tracker."""
 
 
 def silent(fraction: float) -> None:
@@ -35,25 +35,25 @@ class DepthEngine(Protocol):
     """The keyframe depth's heavy parts; tensors live on the engine's device."""
 
     def observe(self, view: DepthView) -> None:
-        """A view that others will be matched with: prepare what depends on its image alone."""
+        """Prepare the image of a view that others will be matched with."""
         ...
 
     def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
-        """Dense depth of every task's keyframe (``estimate_depth``)."""
+        """Estimate the dense depth of every task's keyframe (``estimate_depth``)."""
         ...
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
     ) -> list[DenseDepth]:
-        """Every depth repaired, averaged and judged by its others (``check_depth``).
+        """Repair, average and rate every depth by its others (``check_depth``).
 
         Normals stay as they are.
         """
         ...
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """World points outside the free space of the depths (``vote``); points in front of their
-        sky are in free space."""
+        """Whether world points lie outside the free space of the depths (``vote``); points in
+        front of their sky are in free space."""
         ...
 
     def photo_costs(
@@ -73,7 +73,7 @@ class DepthEngine(Protocol):
 
 
 class AlternativeSearch:
-    """Finds depths in its own way; checks, votes and costs are the ``classical`` engine's."""
+    """A search of its own kind, with the checks, votes and costs of the ``classical`` engine."""
 
     def __init__(self, classical: DepthEngine) -> None:
         self.classical = classical
@@ -92,7 +92,7 @@ class AlternativeSearch:
 
 
 class RevisedSearch(AlternativeSearch, ABC):
-    """Another engine's search with each depth revised by itself."""
+    """Another engine's search, followed by a revision of each single depth."""
 
     def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol."""

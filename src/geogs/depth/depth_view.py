@@ -17,7 +17,7 @@ INFINITY = 1e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewPose:
-    """Where a keyframe was taken."""
+    """Id and pose of a keyframe."""
 
     id: int
     """The keyframe's id."""
@@ -46,9 +46,9 @@ class DepthView(ViewPose):
     image: UInt8[np.ndarray, "wh ww 3"]
     """RGB at the working size."""
     inverse_depth: Float32[np.ndarray, "gh gw"]
-    """The tracker's, on its grid; per map unit."""
+    """Inverse depth of the tracker, on its grid; per map unit."""
     information: Float32[np.ndarray, "gh gw"]
-    """Sum over edges of w |dp/dd|^2; 0 where the tracker knows nothing."""
+    """Sum over edges of w |dp/dd|^2; 0 where the tracker has no depth."""
 
 
 @dataclass(slots=True)
@@ -58,7 +58,7 @@ class KeyframeDepth:
     depth: Float32[np.ndarray, "h w"]
     """z in map units; positive everywhere."""
     confidence: Float32[np.ndarray, "h w"]
-    """In [0, 1]; about the chance that the depth is right to 2 %."""
+    """About the chance, in [0, 1], that the depth is right to 2 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +68,7 @@ class DenseDepth:
     depth: Float32[Tensor, "h w"]
     """z in map units; positive everywhere."""
     confidence: Float32[Tensor, "h w"]
-    """In [0, 1]; about the chance that the depth is right to 2 %."""
+    """About the chance, in [0, 1], that the depth is right to 2 %."""
     median: Float32[Tensor, ""]
     """About the median depth, in host memory; read it as ``typical``."""
     written: torch.cuda.Event | None = None
@@ -80,7 +80,7 @@ class DenseDepth:
 
     @staticmethod
     def of(depth: KeyframeDepth) -> "DenseDepth":
-        """The same memory as CPU tensors."""
+        """Wrap the same memory as CPU tensors."""
         return DenseDepth(
             torch.from_numpy(depth.depth),
             torch.from_numpy(depth.confidence),
@@ -111,7 +111,7 @@ class DenseDepth:
         return replace(self, confidence=confidence)
 
     def under(self, sky: Bool[Tensor, "h w"] | None) -> "DenseDepth":
-        """The depth with that sky, if any."""
+        """The depth with the given sky, if any."""
         if sky is None:
             return self
         return replace(self.unknown_in(sky), sky=sky)
@@ -132,7 +132,7 @@ class DenseDepth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedDepth:
-    """A dense depth and where it was taken."""
+    """A dense depth and its camera pose."""
 
     T_cw: Float64[np.ndarray, "4 4"]
     """World to camera."""
@@ -167,7 +167,7 @@ def homographies(
 
 
 def dense_depths(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
-    """Depths with confidences and their medians, for which the host does not wait for a GPU."""
+    """Join depths and confidences with medians, for which the host does not wait for a GPU."""
     if not maps:
         return []
     medians = torch.stack([depth.flatten().median() for depth, _ in maps])

@@ -1,7 +1,7 @@
-"""Compiled loop of the test at depth edges: which of the surfaces around a pixel it belongs to.
+"""Compiled loop of the test at depth edges: assigns each pixel to one of the surfaces around it.
 
 Arrays are float32 and C-contiguous: maps (h, w), the colour guide (3, h, w), costs (h, w, planes).
-The kernel releases the interpreter lock and does the rows from the first to before the last alone.
+The kernel releases the interpreter lock and processes the rows from ``first`` to before ``last``.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ ONE = np.float32(1.0)
 
 @njit(**_PART)
 def _cost_at(costs, first, spacing, rho):
-    """Matching cost of one pixel, interpolated between planes; at the ends the last one's."""
+    """Matching cost of one pixel, interpolated between planes; beyond the ends, the end's."""
     last = costs.shape[0] - 1
     place = min(max((rho - first) / spacing, ZERO), np.float32(last))
     k = min(int(place), last - 1)
@@ -30,7 +30,7 @@ def _add_sides(
 ):
     """Votes of the pixels (dx, v - y) away on the pixels ``first`` to ``last`` of row y.
 
-    To ``sums`` (5, w) are added the weights of those of the same surface, of farther and of nearer
+    Adds to ``sums`` (5, w) the weights of pixels of the same surface, of farther and of nearer
     ones, and the weighted inverse depths of the farther and of the nearer ones.
     """
     # Views, because an index that could be negative would keep the loop from vectorising.
@@ -61,7 +61,7 @@ def _add_sides(
 
 @njit(**_PART)
 def _around(y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, samples):
-    """Planes of the pixels around, extended to (x, y), with their weights; how many there are.
+    """Extend the planes of the pixels around to (x, y); return their number.
 
     ``samples`` (5, n) receives inverse depth, its slopes, weight and confidence of each.
     """
@@ -87,7 +87,7 @@ def _mode(samples, count, low, high, start, width, rounds, mode):
     """Mean plane of the samples with inverse depth between ``low`` and ``high`` near their mode.
 
     Mean shift from ``start`` with Cauchy's kernel of relative ``width``. ``mode`` receives inverse
-    depth, slopes and confidence; returns the weight behind it.
+    depth, slopes and confidence; returns their weight.
     """
     centre, total = start, ZERO
     across = down = conf = ZERO
@@ -117,13 +117,13 @@ def resolve_edges(
     first, last, rho, slope_x, slope_y, confidence, guide, costs, plane, spacing, reach, contrast,
     gap, width, trust, rounds, moved, new_rho, new_x, new_y, new_confidence,
 ):  # fmt: skip
-    """Give each pixel the plane that those of like colour around it and its matching cost favour.
+    """Give each pixel the plane favoured by like-coloured pixels around it and its matching cost.
 
     Candidates are the modes of the pixels that are farther and nearer by a relative ``gap``; the
     others are of the pixel's own surface. A candidate's score is the log ratio of its weight to the
     own surface's plus ``trust`` times how much less its matching cost is; the best above 0 is
     taken, with ``moved`` times the mean confidence of its voters. The weights of both sides are
-    summed row by row; only pixels that they could move are looked at one by one.
+    summed row by row; only pixels that they could move are examined one by one.
     """
     h, w = rho.shape
     samples = np.empty((5, (2 * reach + 1) ** 2), np.float32)

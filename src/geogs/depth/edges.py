@@ -1,7 +1,7 @@
-"""Which side of a depth edge a pixel is on: colour decides where matching cannot.
+"""Assignment of pixels to a side of a depth edge: colour decides where matching cannot.
 
-A window that holds a silhouette matches at the silhouette's depth, and beside it, on a bare wall,
-nothing contradicts: the foreground is fattened. The wall's colour goes on to the silhouette.
+A window over a silhouette matches at the silhouette's depth, and beside it, on a bare wall, nothing
+contradicts: the foreground is fattened. But the wall's colour extends to the silhouette.
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ from geogs.threads import over_rows
 REACH = 0.019
 """Half side of the window of pixels that vote, in long edges of the image: 6 pixels of 320."""
 LEAST_REACH = 4
-"""The same in pixels, at least."""
+"""Least reach in pixels."""
 CONTRAST = 300.0
-"""How fast a pixel's weight falls with its squared colour difference; the fall is squared, too."""
+"""Rate c of a pixel's weight 1 / (1 + c |dI|^2)^2 by its colour difference."""
 MIN_GAP = 0.015
-"""Relative difference of inverse depth from which a pixel around is of another surface."""
+"""Relative difference of inverse depth from which a nearby pixel is of another surface."""
 WIDTH = 0.02
 """Relative width of the kernel of the mean shift to the mode of such pixels."""
 MEAN_SHIFTS = 3
@@ -29,7 +29,7 @@ COST_TRUST = 6.0
 PASSES = 2
 """Rounds over all pixels; pixels that moved in one no longer vote for the foreground."""
 MOVED_CONFIDENCE = 0.7
-"""Confidence of a pixel that takes another plane, over that of the pixels around, as measured."""
+"""Measured confidence of a pixel that takes another plane, relative to that of its voters."""
 
 
 def reach_of(shape: tuple[int, ...]) -> int:
@@ -43,7 +43,7 @@ def resolve_edges(
     guide: Float32[np.ndarray, "3 h w"],
     sweep: SweepResult,
 ) -> tuple[SlantedDepth, Float32[np.ndarray, "h w"]]:
-    """Depth with each pixel on the surface that it most likely shows, and its confidence.
+    """Put each pixel on the surface that it most likely shows; return depth and confidence.
 
     A pixel may take the plane of farther or nearer pixels around. These are weighted by confidence
     and likeness in colour (adaptive support weights, Yoon and Kweon 2006). The modes of their

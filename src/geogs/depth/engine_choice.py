@@ -1,4 +1,4 @@
-"""Who computes keyframe depths: on the CPU, or on the GPU that holds the map."""
+"""Choice of the depth estimator: on the CPU, or on the GPU that holds the map."""
 
 import torch
 
@@ -19,7 +19,7 @@ def depth_engine(
     """The engine that the settings name for a map on ``device``: depths at the size of ``render``,
     from images at the size of ``working``, of which a GPU holds the ``resident`` used last.
 
-    Raises InputError if the network is asked for and no weights are found or they do not fit.
+    Raises InputError if the network is chosen and its weights are not found or do not fit.
     """
     device, engine = torch.device(device), config.engine
     if device.type == "cuda":

@@ -1,4 +1,4 @@
-"""A dense depth, with a confidence, for a keyframe before any disk is made of it."""
+"""Estimation of a keyframe's dense depth and its confidence, before any disk is made of it."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ def estimate_depth(
 
     Completion of the grid, plane sweep with semi-global matching around it, refinement of both on
     slanted patches, a calibrated confidence, and the sides of depth edges by colour. ``neighbours``
-    are best chosen by ``select_sweep_neighbours``; without any, the completed grid is all there is.
+    are best chosen by ``select_sweep_neighbours``; without any, the completed grid is returned.
     ``limits`` are the nearest and farthest depth to search; by default the tracker's, widened.
     Deterministic; releases the interpreter lock, so that several keyframes can be estimated at once
     in threads.

@@ -12,8 +12,8 @@ from geogs.geometry.camera import Camera
 CONFIDENT_DEVIATION = 0.05
 """Relative deviation at which the confidence in the tracker is 1/2."""
 TRACKER_SCALE = 0.5
-"""Real over expected relative deviation of the tracker's depth, as assumed: more than the median of
-0.2 on rendered rooms, as a cell near an edge may be of either side."""
+"""Assumed ratio of real to expected relative deviation of the tracker's depth: more than the median
+of 0.2 on rendered rooms, as a cell near an edge may be of either side."""
 UNKNOWN_DEVIATION = 10.0
 """Relative deviation of a cell that the completion rejected."""
 BEST_DEVIATION = 0.002
@@ -24,7 +24,7 @@ KINK = 0.04
 
 @dataclass(frozen=True, slots=True)
 class TrackerEvidence:
-    """The completed depth of the tracker at the render size, and how much it counts."""
+    """The completed depth of the tracker at the render size, and its weights."""
 
     inverse_depth: Float32[np.ndarray, "h w"]
     prior_weight: Float32[np.ndarray, "h w"]
@@ -40,7 +40,7 @@ def tracker_evidence(completed: CompletedDepth, working: Camera, render: Camera)
 
 
 def prior_weight(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
-    """1 / (1 + (deviation / confident one)^2) on the grid, 0 where the tracker was rejected.
+    """1 / (1 + (deviation / CONFIDENT_DEVIATION)^2) on the grid, 0 where the tracker was rejected.
 
     It falls to 0 where inverse depth bends sharply between cells: there it is interpolated from
     foreground to background.
@@ -78,7 +78,7 @@ def choose_start(
 
 
 def _flatness(inverse_depth: Float32[np.ndarray, "gh gw"]) -> Float32[np.ndarray, "gh gw"]:
-    """Near 1 on planes, near 0 where inverse depth bends sharply between cells."""
+    """Weight near 1 on planes, near 0 where inverse depth bends sharply between cells."""
     q, bend = inverse_depth, np.zeros_like(inverse_depth)
     bend[:, 1:-1] = np.abs(q[:, 2:] + q[:, :-2] - 2.0 * q[:, 1:-1])
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(q[2:] + q[:-2] - 2.0 * q[1:-1]))

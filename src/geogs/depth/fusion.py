@@ -11,8 +11,8 @@ from geogs.depth.reprojection_kernels import agree_on_depth, splat_depth
 from geogs.geometry.camera import Camera
 
 BIAS, OWN, SUPPORT, VIOLATION = -0.10, 0.66, 0.72, -0.92
-"""Logistic regression of "relative error below 2 %", as in ``depth_confidence``, on the confidence
-and the others' votes."""
+"""Coefficients of a logistic regression of "relative error below 2 %", as in ``depth_confidence``,
+on the confidence and the others' votes."""
 SPLAT_CONFIDENCE = 0.5
 """Confidence from which pixels of other keyframes repair this one."""
 
@@ -21,7 +21,7 @@ AVERAGE_REACH = 0.01
 AGREEMENT_REACH = 0.015
 """Relative distance within which another keyframe's depth supports a pixel."""
 VIOLATION_DISTANCE = 0.05
-"""Relative distance in front of another keyframe's depth that speaks against a pixel."""
+"""Relative distance in front of another keyframe's depth beyond which a pixel violates it."""
 REPAIR_BELOW = 0.4
 """Confidence below which a pixel takes the depth that others agree on."""
 REPAIR_VOTES = 1.0
@@ -39,13 +39,13 @@ def check_depth(
     other_poses: Sequence[Float64[np.ndarray, "4 4"]],
     camera: Camera,
 ) -> KeyframeDepth:
-    """A keyframe's depth repaired, averaged and judged by those of other keyframes.
+    """Repair, average and rate a keyframe's depth by those of other keyframes.
 
     Pixels of low confidence on whose depth several others agree take it. Then each pixel's point is
     looked up in the other views: surfaces within ``AVERAGE_REACH`` (relative, Gaussian) are
     averaged by confidence; those near support the pixel; confident ones that are clearly behind the
-    point violate it, since they see free space where it stands. Meant to be called once per
-    estimate: votes counted twice raise the confidence too far.
+    point violate it, since they see free space at its position. To be called once per estimate:
+    votes counted twice raise the confidence too far.
     """
     T_wc = np.linalg.inv(T_cw)
     depth = _repair(depth, T_wc, others, other_poses, camera)

@@ -12,25 +12,25 @@ from geogs.geometry.camera import Camera
 from geogs.world.grid import OFFSET, STRIDE
 
 DEVIATION_SCALE = 0.14
-"""Real over expected deviation of the tracker's inverse depth, as measured on rendered rooms."""
+"""Ratio of real to expected deviation of the tracker's inverse depth, from rendered rooms."""
 BENDING = 0.02
-"""Usual second difference of inverse depth per cell, over its median."""
+"""Typical second difference of inverse depth per cell, relative to its median."""
 MEMBRANE = 0.3
-"""Usual first difference of inverse depth per cell, over its median: large for slanted surfaces."""
+"""Typical first difference per cell, relative to the median: large for slanted surfaces."""
 EDGE_SHARPNESS = 48.0
-"""How fast smoothness falls with the image gradient (Lab, 0 to 1 per pixel)."""
+"""Rate k of smoothness exp(-k g) by the image gradient g (Lab, 0 to 1 per pixel)."""
 
 
 @dataclass(frozen=True)
 class CompletedDepth:
-    """Smooth inverse depth on the tracker's grid, and how certain the tracker was of it."""
+    """Smooth inverse depth on the tracker's grid, and the tracker's certainty."""
 
     inverse_depth: Float32[np.ndarray, "gh gw"]
-    """Per map unit."""
+    """Inverse depth, per map unit."""
     deviation: Float32[np.ndarray, "gh gw"]
     """Relative standard deviation z / sqrt(information) that the bundle adjustment expects."""
     inlier: Bool[np.ndarray, "gh gw"]
-    """Where the tracker's own value survived the robust fit."""
+    """Cells whose value of the tracker survived the robust fit."""
 
 
 def complete_inverse_depth(
@@ -41,10 +41,10 @@ def complete_inverse_depth(
     """Fit a smooth surface to the tracker's inverse depth, weighted by its information.
 
     Minimises sum rho((x - d) / s) + sum w (second differences)^2 + a weak sum w (differences)^2,
-    by reweighted least squares with the Cauchy weight (it is linear, so that each round solves for
-    it outright, beside the least-squares loop); w falls at image edges. s is the deviation
+    by reweighted least squares with the Cauchy weight (it is linear, so each round solves it
+    directly, without the general least-squares loop); w falls at image edges. s is the deviation
     of inverse depth, ``DEVIATION_SCALE`` / sqrt(information), plus 0.2 % of d. Cells without a
-    finite positive value or with no information get theirs from around them.
+    finite positive value or without information are filled from around them.
     """
     smooth = edge_weights(image, inverse_depth.shape)
     return complete_grid(inverse_depth, information, smooth)
@@ -55,7 +55,7 @@ def complete_grid(
     information: Float32[np.ndarray, "gh gw"],
     smooth: Float32[np.ndarray, "gh gw"],
 ) -> CompletedDepth:
-    """``complete_inverse_depth`` with the weights of smoothness as ``edge_weights`` has them."""
+    """``complete_inverse_depth`` with given weights of smoothness, such as ``edge_weights``."""
     known = known_cells(inverse_depth, information)
     if not known.any():
         one = np.ones_like(inverse_depth)
@@ -82,7 +82,7 @@ def complete_grid(
 def known_cells(
     inverse_depth: Float32[np.ndarray, "gh gw"], information: Float32[np.ndarray, "gh gw"]
 ) -> Bool[np.ndarray, "gh gw"]:
-    """Cells whose depth the tracker knows."""
+    """Whether the tracker has a depth of each cell."""
     known = np.isfinite(inverse_depth) & (inverse_depth > 1e-6)
     return known & np.isfinite(information) & (information > 0)
 

@@ -14,18 +14,18 @@ from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
 
 PLANE_STEP = 1.2
-"""Pixels that the median neighbour moves from plane to plane: none skips a match, which a parabola
-and the refinement then find between planes."""
+"""Pixels that the median neighbour moves from plane to plane: few enough that no match is skipped;
+a parabola and the refinement then find it between planes."""
 LEAST_PART = 1 / 3
-"""Least fraction of the most planes that is swept, however little the neighbours move."""
+"""Least number of planes as a fraction of the most, however little the neighbours move."""
 WINDOW = 3
 """Side of the matching window in pixels: small, as like colours are averaged after it."""
 VARIANCE_FLOOR = 1e-5
-"""Grey variance (grey in 0 to 1) below which a window counts as without texture: noise."""
+"""Grey variance (grey in 0 to 1) below which a window counts as textureless: noise."""
 SUPPORT_RADIUS = 3
-"""Pixels over which matching costs are averaged."""
+"""Radius in pixels over which matching costs are averaged."""
 SUPPORT_SHARPNESS = 400.0
-"""How fast their weight falls with the squared colour difference (RGB in 0 to 1)."""
+"""Rate c of their weight 1 / (1 + c |dI|^2)^2 by the colour difference (RGB in 0 to 1)."""
 PRIOR_PULL = 0.3
 """Cost of a plane far from the tracker's depth where the tracker is confident."""
 PRIOR_TOLERANCE = 0.03
@@ -35,7 +35,7 @@ SMALL_JUMP = 0.1
 LARGE_JUMP = 1.5
 """Semi-global matching: cost of a larger step where the image is flat."""
 JUMP_CONTRAST = 30.0
-"""Semi-global matching: how fast the large step gets cheaper with the grey difference."""
+"""Semi-global matching: rate c of the larger step's cost ``LARGE_JUMP`` / (1 + c |dI|)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class SweepResult:
     cost: Float32[np.ndarray, "h w"]
     """Matching cost 1 - NCC of the winner, 0 (alike) to 1.2."""
     margin: Float32[np.ndarray, "h w"]
-    """Aggregated cost of the best other plane less the winner's: how unique the match is."""
+    """Aggregated cost of the best other plane minus the winner's: uniqueness of the match."""
     planes: Float32[np.ndarray, "p"]
     """Inverse depths that were tried, equally spaced."""
     costs: Float32[np.ndarray, "h w p"]
@@ -63,8 +63,7 @@ def sweep_planes(
 ) -> Float32[np.ndarray, "p"]:
     """At most ``most`` inverse depths, and at least ``LEAST_PART`` of these, equally spaced.
 
-    The median of the neighbours, of which there must be one, moves ``PLANE_STEP`` from one to the
-    next.
+    The median neighbour moves ``PLANE_STEP`` from one to the next; there must be a neighbour.
     """
     pixels = np.array([[x, y] for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)])
     pixels = pixels * [camera.width, camera.height] - [camera.cx, camera.cy]

@@ -2,7 +2,7 @@
 
 Images are (h, w); cost volumes are (h, w, planes), so that the innermost loops run over planes with
 unit stride. All arrays are float32 and C-contiguous. Every kernel releases the interpreter lock;
-those that are given the first row and the one behind the last do the rows between them alone.
+those with parameters ``first`` and ``last`` process the rows from ``first`` to before ``last``.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ STRIP = 32
 """Rows matched at a time, so that all buffers stay in the first cache levels."""
 FAR = np.float32(1e9)
 OUTSIDE = np.float32(1.2)
-"""Cost of a sample outside the neighbour, a little more than that of no likeness (1)."""
+"""Cost of a sample outside the neighbour, a little more than that of no similarity (1)."""
 
 _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 _PART = inlined(_FAST)
@@ -96,8 +96,8 @@ def _column_sums(rows, first, radius, out):
 def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
     """1 - NCC from the window sums, inserted into the sorted smallest costs ``best`` (keep, w).
 
-    ``scale`` is 1 / sqrt(variance + floor) of the reference windows, which softens the likeness of
-    windows without texture to nothing.
+    ``scale`` is 1 / sqrt(variance + floor) of the reference windows, which reduces the similarity
+    of textureless windows to nothing.
     """
     keep = best.shape[0]
     for x in range(sum_b.shape[0]):
@@ -115,7 +115,7 @@ def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
 
 @njit(**_PART)
 def _count_inside(lowest, seen):
-    """One more where the sample lies in the image."""
+    """Increase the counts ``seen`` where the sample lies in the image."""
     for x in range(seen.shape[0]):
         seen[x] += np.int32(lowest[x] < OUTSIDE)
 
@@ -148,7 +148,7 @@ def match_planes(first, last, reference, mean, scale, pairs, a, b, planes, radiu
     """volume[y, x, k] = mean of the smaller half of 1 - NCC over the neighbours, at plane k.
 
     That is half of those into whose images the pixel falls, rounded up, but at least two (one if
-    there is but one), so that what few look at is matched with these; who is missing costs OUTSIDE.
+    there is only one), so a pixel that few see is matched with these; a missing one costs OUTSIDE.
     ``pairs`` (n, h, w) are the ``pixel_pairs`` of the neighbours; ``a`` (n, 3, 3), ``b`` (n, 3):
     their homographies a + rho b e_3^T (float64). Windows have (2 radius + 1)^2 pixels; image
     borders repeat: ``reference`` has ``radius`` more columns a side that do. Images should be
@@ -204,7 +204,7 @@ def match_planes(first, last, reference, mean, scale, pairs, a, b, planes, radiu
 @njit(**_PART)
 def _likeness_of_row(guide, y, v, dx, contrast, weights):
     """1 / (1 + contrast |dI|^2)^2 of the pixels of row ``y`` and those (dx, v - y) away; 0 where
-    that is none."""
+    there is none."""
     w = guide.shape[1]
     first, last, one = max(0, -dx), min(w, w - dx), np.float32(1.0)
     weights[:first] = np.float32(0.0)
@@ -332,7 +332,7 @@ def aggregate_paths(volume, image, small, large, edge, forward, total):
 
 @njit(**_FAST)
 def pick_planes(first, last, total, volume, position, cost, margin):
-    """Winning plane with its parabola's vertex, its matching cost, and how far the others are.
+    """Winning plane with its parabola's vertex, its matching cost, and its margin to the others.
 
     ``margin`` is the smallest aggregated cost more than two planes away less the winner's.
     """

@@ -18,16 +18,16 @@ from geogs.threads import over_rows
 PATCH_REACH = 2
 """Patches of 5 x 5 samples, one render pixel apart."""
 PATCH_CONTRAST = 500.0
-"""How fast a patch sample's weight falls with its grey difference, squared."""
+"""Rate c of a patch sample's weight 1 / (1 + c d^2) by its grey difference d."""
 REFINE_STEPS = (2, 2, 1)
-"""Stride over the samples of a patch in each photometric step, which a fit of local planes follows.
-Every second sample, those of one colour on a chessboard, is enough but in the last step."""
+"""Stride over the samples of a patch in each photometric step; a fit of local planes follows each.
+Every second sample, like one colour of a chessboard, is enough except in the last step."""
 STEP_LIMIT = 0.03
 """Largest step, relative to inverse depth: beyond it patches are no longer alike."""
 PHOTO_DEVIATION = 0.07
 """Deviation of a photometric optimum times the root of its curvature, as measured."""
 FIT_RADIUS = 4
-"""Pixels around the centre that make the fit of a local plane."""
+"""Radius in pixels of the fit of a local plane."""
 FIT_DEVIATION = 0.01
 """Relative deviation at which a pixel counts half in it."""
 FIT_TOLERANCE = 0.01
@@ -35,11 +35,11 @@ FIT_TOLERANCE = 0.01
 FIT_STIFFNESS = 0.5
 """Weight of the previous slopes in it, in confident pixels at distance 1."""
 GUIDE_CONTRAST = 200.0
-"""How fast a pixel's weight in it falls with its colour difference, squared."""
+"""Rate c of a pixel's weight in it, 1 / (1 + c |dI|^2), by its colour difference."""
 PLANE_DEVIATION = 0.003
-"""Usual relative distance of a surface from local planes."""
+"""Typical relative distance of a surface from local planes."""
 FLOOR_DEVIATION = 0.002
-"""Relative deviation that no number of matches gets below (pose, calibration, resampling)."""
+"""Least relative deviation for any number of matches (pose, calibration, resampling)."""
 FULL_SUPPORT = 5.0
 """Support from which a local plane counts fully."""
 
@@ -93,7 +93,7 @@ def refine_depth(
     They begin at the inverse depth ``rho``; ``confidence`` (0 to 1) weights the pixels in the first
     planes; ``guide`` is the image of :func:`colour_guide`. After each step inverse depth is the
     precision-weighted mean of the photometric optimum, the tracker's value (robust) and the local
-    plane.
+    plane's.
     """
     patches = _gather_patches(reference, neighbours, render, working)
     compared = {step: patches.every(step) for step in set(REFINE_STEPS)}
@@ -121,8 +121,8 @@ def refine_depth(
 def _photometric_step(state: SlantedDepth, patches: _Patches) -> Float32[np.ndarray, "h w"]:
     """Move ``state`` one bounded step; returns the relative precision of the optimum.
 
-    The deviation of a single optimum is measured to be ``PHOTO_DEVIATION`` over the square
-    root of the curvature (by relative inverse depth), whatever the likeness of the patches.
+    The measured deviation of a single optimum is ``PHOTO_DEVIATION`` over the square root of the
+    curvature (by relative inverse depth), however similar the patches are.
     """
     rho = state.inverse_depth
     step, curvature = np.empty_like(rho), np.empty_like(rho)
@@ -176,7 +176,7 @@ def _gather_patches(
     render: Camera,
     working: Camera,
 ) -> _Patches:
-    """The fine reference image around every render pixel; likeness to the centre as weight."""
+    """The fine reference image around every render pixel; similarity to the centre as weight."""
     reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)
     offsets = np.stack(np.meshgrid(reach, reach), -1).reshape(-1, 2)
     columns = np.arange(render.width) - render.cx

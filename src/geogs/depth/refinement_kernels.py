@@ -2,8 +2,8 @@
 
 A surface is described per pixel by its inverse depth and the two slopes of inverse depth in units
 per render pixel: a plane in space has constant slopes. Rows are processed sample by sample so that
-the loops over x vectorise; all but the gathering of image samples does. Kernels that are given the
-first row and the one behind the last do the rows between them alone.
+the loops over x vectorise; all but the gathering of image samples does. Kernels with parameters
+``first`` and ``last`` process the rows from ``first`` to before ``last``.
 """
 
 import numpy as np
@@ -88,7 +88,7 @@ def photometric_step(
     patches (s, h, w): the reference at each patch sample; offsets (s, 2): (x, y) in render pixels;
     weights (s, h, w): support weights; pairs: ``pixel_pairs`` of the neighbours. Writes the step
     of inverse depth and the curvature of the sum of (1 - NCC) by inverse depth; neighbours that do
-    not match (NCC below 0.4, or partly out of view) count for nothing, better ones for more.
+    not match (NCC below 0.4, or partly out of view) have weight 0, better ones a larger weight.
     """
     count, _, w = patches.shape
     n = pairs.shape[0]
@@ -164,13 +164,13 @@ def fit_planes(
 ):  # fmt: skip
     """Weighted least-squares plane of inverse depth around each pixel (bilateral, robust).
 
-    A pixel within ``radius`` counts by its confidence, its likeness in colour
-    1 / (1 + contrast |dI|^2) over ``guide`` (3, h, w), and how near it lies to the present plane,
-    1 / (1 + (d rho / (tolerance rho))^2). ``stiffness`` holds
-    the slopes at their present values. ``support`` is the sum of weights.
+    The weight of a pixel within ``radius`` is the product of its confidence, its likeness in colour
+    1 / (1 + contrast |dI|^2) over ``guide`` (3, h, w), and its closeness to the current plane
+    1 / (1 + (d rho / (tolerance rho))^2). ``stiffness`` ties the slopes to their current values.
+    ``support`` is the sum of weights.
     """
     h, w = rho.shape
-    # What one row of samples adds; what it is multiplied by is the same for all of a row.
+    # Sums over one row of samples; their factor is the same for the whole row.
     row = np.empty((5, w), np.float32)
     sums = np.empty((9, w), np.float32)
     for y in range(first, last):
@@ -233,7 +233,7 @@ def _add_samples(
 
 @njit(**_PART)
 def _add_row(row, fy, sums):
-    """The moments by x of a row that is ``fy`` away, as moments by both."""
+    """Add the moments by x of a row that is ``fy`` away to the moments by x and y."""
     for x in range(row.shape[1]):
         m, mx, r = row[0, x], row[1, x], row[3, x]
         sums[0, x] += m

@@ -66,7 +66,7 @@ def splat_depth(points, confidence, rotation, translation, lens, least, depth, w
 
 @njit(**_FAST)
 def agree_on_depth(depths, weights, mask, reach, clearance, penalty, best, score):
-    """The best of several depths of each pixel in a ``mask``; 0 is none, as outside the mask.
+    """The best of several depths of each pixel in a ``mask``; 0 for none and outside the mask.
 
     depths, weights (n, h, w); mask (h, w). A depth's score is the sum of weights of those near it
     (Gaussian, relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of

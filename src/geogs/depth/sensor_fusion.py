@@ -1,4 +1,4 @@
-"""A keyframe's searched depth fused with that of a sensor."""
+"""Fusion of a keyframe's searched depth with that of a sensor."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from geogs.depth.depth_view import DenseDepth
 TOLERANCE = 0.02
 """Relative error below which a depth is right: confidences are the chance of that."""
 MIN_DEVIATION = 0.02
-"""Least relative deviation of a searched depth beside a measured one."""
+"""Least relative deviation of a searched depth where there is a measured one."""
 MAX_DIFFERENCE = 3.0
 """Standard deviations of the difference beyond which the searched depth is an outlier."""
 MAX_CONFIDENCE = 0.98
@@ -26,8 +26,8 @@ def fused_with_sensor(
 ) -> DenseDepth:
     """Mean of the searched and the measured depth, weighted by their inverse variances.
 
-    Where they do not agree, the measured depth; where nothing was measured, the searched one. What
-    was measured is an inverse depth, per map unit, and its information 1 / sigma^2, 0 for none.
+    Where they do not agree, the measured depth; where nothing was measured, the searched one. The
+    measurement is an inverse depth, per map unit, and its information 1 / sigma^2, 0 for none.
     """
     known = information > 0
     measured = torch.where(known, 1 / inverse_depth.clamp(min=1e-12), searched.depth)

@@ -11,10 +11,10 @@ from geogs.geometry.camera import Camera
 from geogs.world.grid import OFFSET, STRIDE
 
 NEIGHBOURS = 8
-"""Keyframes to match one with: more of them are too far aside."""
+"""Keyframes to match one with: further ones are too far aside."""
 BEST_PARALLAX_DEG = 6.0
-"""Best angle between the rays of two keyframes: at smaller ones depth is less precise, at larger
-ones surfaces look less alike."""
+"""Best angle between the rays of two keyframes: smaller ones make depth less precise, larger ones
+change the appearance of surfaces."""
 MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 1.0, 25.0
 """Least and largest usable angle."""
 MAX_VIEW_ANGLE_DEG = 35.0
@@ -22,22 +22,22 @@ MAX_VIEW_ANGLE_DEG = 35.0
 MIN_OVERLAP = 0.3
 """Least fraction of a keyframe's points that another has to see."""
 USUAL_ZOOM = 1.5
-"""Ratio of the distances from two keyframes at which a surface looks less alike."""
+"""Ratio of the distances from two keyframes at which the appearance of a surface changes."""
 MAX_BASELINE_COSINE = 0.97
 """Largest cosine between two baselines where there is a choice."""
 _RASTER = 9
-"""Points along either side of an image by which pairs are judged."""
+"""Points along either side of an image from which pairs are rated."""
 RANGE_MARGIN = 1.3
-"""Factor by which the range exceeds that of the known depths, which are not all."""
+"""Factor by which the range exceeds that of the known depths, as not all are known."""
 RANGE_DEVIATION = 0.1
-"""Relative deviation of the tracker's depths that count for the range in any case."""
+"""Relative deviation below which the tracker's depths always count for the range."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPairs:
-    """Geometry of pairs of one keyframe and others, by a raster of points at its typical depth.
+    """Geometry of pairs of one keyframe and others, from a raster of points at its typical depth.
 
-    The points are all over the image: a camera that moves straight on sees no parallax ahead.
+    The points cover the image: a camera that moves straight on sees no parallax ahead.
     """
 
     parallax: Float64[np.ndarray, "n"]
@@ -151,7 +151,7 @@ def depth_range(
 
     The range of the tracker's depths in all views, seen from the reference, widened by
     ``RANGE_MARGIN`` on both sides; of each view the more certain half, and all below
-    ``RANGE_DEVIATION``, count. (0.1, 10) if the tracker knows next to nothing.
+    ``RANGE_DEVIATION``, count. (0.1, 10) if the tracker knows hardly any depth.
     """
     inverse = seen_inverse_depth(reference, (reference, *others), working)
     if len(inverse) < 8:

@@ -12,7 +12,7 @@ from geogs.depth.grid_completion import known_cells, upsample_grid
 from geogs.geometry.camera import Camera
 
 VALID_DEVIATION = 0.3
-"""Relative deviation, as the adjustment expects it, up to which a cell's depth is valid."""
+"""Relative deviation, estimated by the adjustment, up to which a cell's depth is valid."""
 
 
 def enlarged_depth(
@@ -23,8 +23,8 @@ def enlarged_depth(
 ) -> KeyframeDepth:
     """Inverse depth of the tracker's grid, bilinear between the cells that are valid.
 
-    A pixel is valid, with confidence 1, where these have more than half of the weight; elsewhere it
-    has the median depth with confidence 0.
+    A pixel is valid, with confidence 1, if these have more than half of the weight; else it has the
+    median depth with confidence 0.
     """
     valid = known_cells(grid, information)
     valid &= (VALID_DEVIATION * grid) ** 2 * information > 1
@@ -58,7 +58,7 @@ class TrackerDepthEngine(AlternativeSearch):
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
     ) -> list[DenseDepth]:
-        """As in the protocol; the depths stay what they are."""
+        """As in the protocol; the depths stay as they are."""
         return [d.depth for d in depths]
 
     def _dense(self, depth: KeyframeDepth) -> DenseDepth:

@@ -1,4 +1,4 @@
-"""Warnings on a comparison of two trajectories whose errors may mean little."""
+"""Warnings on trajectory comparisons whose errors may be meaningless."""
 
 import numpy as np
 
@@ -6,17 +6,17 @@ from geogs.evaluation.trajectory_errors import MAX_ROLL, TrajectoryErrors, exten
 from geogs.types import Trajectory
 
 FEWEST_MATCHED = 0.5
-"""Part of the shorter trajectory whose poses have to match in time."""
+"""Least fraction of the shorter trajectory whose poses match in time."""
 FEWEST_OF_ESTIMATE = 0.2
-"""Part of the estimate that has to be compared, where the truth has fewer poses."""
+"""Least compared fraction of the estimate, where the truth has fewer poses."""
 FEWEST_PAIRS = 8
-"""Poses below which a similarity fits nearly anything."""
+"""Least number of poses; a similarity fits nearly any fewer."""
 MAX_ERROR = 0.5
-"""Error, of the extent of the true path, beyond which the two have little in common."""
+"""Largest error relative to the extent of the true path."""
 MAX_SPEED = 150.0
-"""Metres a second at which hardly any camera moves."""
+"""Largest plausible speed of a camera, m/s."""
 MAX_FACTOR = 1.5
-"""Factor between the sizes of two paths that are both said to be in metres."""
+"""Largest ratio of the sizes of two paths that are both given in metres."""
 
 
 def doubts(
@@ -26,13 +26,13 @@ def doubts(
     max_difference: float,
     is_metric: bool,
 ) -> list[str]:
-    """Why the errors may not mean what they seem to; empty where nothing speaks against them.
+    """Reasons why the errors may be misleading; empty if there are none.
 
     Args:
-        errors: of the two trajectories that follow.
-        estimate: in any unit.
-        reference: in metres.
-        max_difference: of the times of poses that were compared, seconds.
+        errors: errors of the following two trajectories.
+        estimate: estimated poses, in any unit.
+        reference: true poses, in metres.
+        max_difference: largest time difference of compared poses, seconds.
         is_metric: whether the estimate claims to be in metres.
     """
     sentences = (

@@ -1,8 +1,8 @@
-"""How long something took, in words."""
+"""Durations in words."""
 
 
 def duration(seconds: int | float) -> str:
-    """A time as people say it."""
+    """Format a time in seconds, minutes and hours."""
     whole = round(seconds)
     if whole < 60:
         return f"{seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""What the way in which a camera was held tells of a scene."""
+"""Scene axes and viewing geometry from the camera poses."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,10 +7,10 @@ from jaxtyping import Float
 def level_axes(
     T_wc: Float[np.ndarray, "n 4 4"], up: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "3 3"]:
-    """Rows right, forward, up of the world as the camera was held.
+    """Rows right, forward, up of the world, estimated from the camera poses.
 
-    Up, where it is not given, is against the mean of the image's down axis (people hold cameras
-    upright); right is the direction of most motion at right angles to it.
+    Up, where it is not given, is opposite to the mean of the image's down axis (cameras are mostly
+    held upright); right is the direction of most motion perpendicular to it.
     """
     up = -T_wc[:, :3, 1].mean(0) if up is None else up
     norm = np.linalg.norm(up)
@@ -29,7 +29,7 @@ def look_at_one_place(T_wc: Float[np.ndarray, "k 4 4"]) -> bool:
     """Whether the optical axes of all cameras pass near one point in front of them.
 
     The point nearest to all axes must be in front of every camera and, on average, at most a
-    tenth of its distance beside the axis; and the cameras must be apart by at least a tenth of it.
+    tenth of its distance off the axis; and the cameras must be apart by at least a tenth of it.
     """
     axes, centres = T_wc[:, :3, 2], T_wc[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

@@ -1,4 +1,4 @@
-"""Errors of positions beside their predicted deviations: are they as large as predicted?"""
+"""Calibration of predicted standard deviations: comparison with the true position errors."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 @dataclass(frozen=True)
 class Reliability:
-    """Errors of positions and their predicted deviations."""
+    """Position errors and their predicted standard deviations."""
 
     error: Float[np.ndarray, "n"]
     """Length of each error."""
@@ -21,30 +21,30 @@ class Reliability:
 
     @property
     def within_two_sigma(self) -> float:
-        """Fraction of the frames whose error is at most two predicted deviations."""
+        """Fraction of the frames whose error is at most two predicted standard deviations."""
         return float((self.error <= 2 * self.sigma).mean())
 
     @property
     def error_per_sigma(self) -> float:
-        """Errors over deviations, both root mean square: 1 where they are as large as predicted."""
+        """Ratio of root mean squares of errors and standard deviations: 1 if as predicted."""
         variance = float(np.square(self.sigma).mean())
         return float(np.sqrt(np.square(self.error).mean() / max(variance, 1e-300)))
 
     def observed(self, predicted: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-        """Fractions of the frames that lie as near as predicted for such fractions of them.
+        """Observed fractions of frames within the error bounds of the predicted fractions.
 
-        Errors are taken for normal and alike along the three axes, so that three times their
-        square by the variance of all axes together follows a chi-squared distribution with three
+        Errors are assumed normal and equal along the three axes, so that three times their square
+        over the variance of all axes together follows a chi-squared distribution with three
         degrees of freedom.
         """
         from scipy.special import chdtr
 
-        # The fraction of frames that is predicted to lie nearer than this one does.
+        # Predicted fraction of frames with a smaller error than this one.
         edge = chdtr(3, 3 * np.square(self.error / np.maximum(self.sigma, 1e-300)))
         return (edge <= predicted[:, None]).mean(1)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Values for JSON."""
         observed = self.observed(np.array(LEVELS))
         return {
             "frames": len(self.error),
@@ -61,15 +61,15 @@ def reliability(
     known_times: Float[np.ndarray, "m"],
     sigma: Float[np.ndarray, "m"],
 ) -> Reliability | None:
-    """Errors at some times beside the deviations of the frames nearest in time.
+    """Pair errors with the standard deviations of the frames nearest in time.
 
     None where no deviation is finite.
 
     Args:
-        times: of the errors, seconds.
-        error: their lengths.
-        known_times: of the frames whose position is known, ascending.
-        sigma: their deviations, in the unit of the errors; infinite where nothing is known.
+        times: times of the errors, seconds.
+        error: lengths of the errors.
+        known_times: times of the frames with a known position, ascending.
+        sigma: their standard deviations, in the unit of the errors; infinite where unknown.
     """
     middle = (known_times[1:] + known_times[:-1]) / 2
     nearest = sigma[np.searchsorted(middle, times)] if len(sigma) else np.full(len(times), np.inf)

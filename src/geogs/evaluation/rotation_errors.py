@@ -1,4 +1,4 @@
-"""How far orientations are from the true ones: aligned by themselves, or from pose to pose."""
+"""Rotation errors: of aligned orientations, or relative between poses."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,17 +17,17 @@ def rotation_angle(
 def best_rotation(
     estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Rotation of the world that takes the estimated orientations nearest to the others."""
+    """World rotation that best aligns the estimated orientations to the reference."""
     return nearest_rotation((reference @ estimate.transpose(0, 2, 1)).sum(0))
 
 
 def stretches(
     along: Float[np.ndarray, "n"], length: float
 ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """First and last poses of the stretches of the path that are ``length`` long.
+    """First and last poses of all stretches of the path of ``length``.
 
     ``along`` is the length of the path up to each pose, ascending. A stretch begins at each pose
-    that has as much of the path after it.
+    with enough of the path after it.
     """
     last = np.searchsorted(along, along + length * (1 - 1e-9))
     first = np.flatnonzero(last < len(along))
@@ -43,7 +43,7 @@ def relative_rotation_error(
     """Angle in degrees between the estimated and the true rotation from ``first`` to ``last``.
 
     It is the rotation of the relative pose error (RPE; Sturm et al. 2012), which does not depend on
-    how the trajectories are aligned.
+    the alignment of the trajectories.
     """
     found, true = (R[first].transpose(0, 2, 1) @ R[last] for R in (estimate, truth))
     return rotation_angle(found, true)

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the true one."""
+"""Errors of an estimated trajectory against the true one."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,16 +21,16 @@ from geogs.types import Trajectory
 Alignment = Literal["sim3", "se3", "none"]
 
 STRETCH = 0.1
-"""Length of the stretches over which relative rotations are compared, of the whole path."""
+"""Length of the stretches for relative rotation errors, relative to the whole path."""
 MAX_ROLL = 5.0
-"""Degrees by which alignment may leave the world's rotation open for absolute ones to count."""
+"""Largest uncertainty of the aligned rotation, in degrees, for absolute rotation errors."""
 
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Absolute trajectory error after alignment, and what it rests on.
+    """Absolute trajectory error after alignment, with its data.
 
-    Lengths in cm where the name says so, else in metres (the unit of the reference).
+    Lengths in cm where the name ends so, else in metres (the unit of the reference).
     """
 
     ate_rmse_cm: float
@@ -41,23 +41,23 @@ class TrajectoryErrors:
     rotation_rmse_deg: float
     """Angle between aligned and true orientation, root mean square."""
     relative_rotation_rmse_deg: float | None
-    """Relative rotation error over stretches of the path, which no alignment changes; none where
+    """Relative rotation error over stretches of the path, independent of the alignment; none where
     the reference does not move."""
     stretch_m: float
     """Length of these stretches."""
     roll_deg: float
-    """About how far the alignment may be turned about the line that the path is nearest to: the
-    angle under which the position error is seen at the path's distance from it; 0 where positions
-    do not align."""
+    """Approximate uncertainty of the alignment's rotation about the line that fits the path best:
+    the angle of the position error at the path's distance from it; 0 where the alignment is not by
+    positions."""
     scale: float
     """Length in the reference per length in the estimate."""
     alignment: Alignment
     pairs: int
-    """Poses that were compared."""
+    """Number of compared poses."""
     estimated: int
-    """Poses in the estimate."""
+    """Number of poses in the estimate."""
     reference: int
-    """Poses in the reference."""
+    """Number of poses in the reference."""
     path_length_m: float
     """Length of the compared part of the reference."""
     T_ref_est: Float[np.ndarray, "4 4"]
@@ -75,7 +75,7 @@ class TrajectoryErrors:
 
     @property
     def rotations(self) -> tuple[str, Float[np.ndarray, "n"], float]:
-        """The kind of rotation errors that counts, these errors, and their root mean square.
+        """The kind of rotation errors to report, the errors, and their root mean square.
 
         It is "absolute" where the alignment is determined well enough, else "relative".
         """
@@ -115,11 +115,11 @@ def evaluate_trajectory(
     max_difference: float = 0.02,
     alignment: Alignment = "sim3",
 ) -> TrajectoryErrors:
-    """ATE of the camera positions, as ``evo_ape tum -a(s)`` computes it.
+    """ATE of the camera positions, as computed by ``evo_ape tum -a(s)``.
 
     Poses are paired by time (:func:`associate`), the estimate is aligned (Sim(3) for monocular
     runs, whose scale is free) and compared. Poses that are not finite are left out. An estimate
-    that has orientations alone, all at one place, is aligned by these, at scale 1.
+    with orientations only, all at one position, is aligned by these, at scale 1.
 
     Raises InputError if fewer than three poses match in time or the motion does not determine an
     alignment.
@@ -189,7 +189,7 @@ def _similarity(
 
 
 def _roll(positions: Float[np.ndarray, "n 3"], error: Float[np.ndarray, "n"]) -> float:
-    """Angle in degrees under which the error is seen at the distance of a path from its line."""
+    """Angle in degrees of the error at the distance of a path from its best-fitting line."""
     across = np.linalg.svd(positions - positions.mean(0), compute_uv=False)[1:]
     return float(np.degrees(np.arctan2(np.linalg.norm(error), np.linalg.norm(across))))
 
@@ -201,7 +201,7 @@ def finite_poses(trajectory: Trajectory) -> Trajectory:
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """For each time the index of the nearest other."""
+    """Index of the nearest of ``others`` for each time."""
     order = np.argsort(others, kind="stable")
     ordered = others[order]
     right = np.searchsorted(ordered, times).clip(0, len(others) - 1)
@@ -222,7 +222,7 @@ def _no_match(reference: Trajectory, estimate: Trajectory, pairs: int, maximum: 
 
 
 def extent_of(T_wc: Float[np.ndarray, "n 4 4"]) -> float:
-    """Root of the mean squared distance of the places from their middle; 0 where there is none."""
+    """Root mean square distance of the positions from their mean; 0 where there are none."""
     places = T_wc[:, :3, 3]
     if not len(places):
         return 0.0

@@ -1,4 +1,4 @@
-"""True poses of whatever data set there is, and the images that belong to them."""
+"""True poses of any data set, and the images that belong to them."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,24 +17,24 @@ from geogs.types import Trajectory
 
 _METRES = {"millimetres": 0.001}
 _MODEL = ("images.txt", "cameras.txt")
-"""Files of a COLMAP model, of which one may stand for it."""
+"""Files of a COLMAP model; each one may be given for it."""
 
 
 @dataclass(frozen=True)
 class TrueScene:
-    """The truth about the cameras."""
+    """Ground truth of the cameras."""
 
     path: Path
     trajectory: Trajectory
-    """In metres (or the data set's own unit where that is arbitrary)."""
+    """Poses in metres (or the data set's own unit where that is arbitrary)."""
     metres: float = 1.0
-    """Per unit of the data set."""
+    """Metres per unit of the data set."""
 
     def images(self, long_edge: int) -> PosedSource:
         """The images with their poses in the data set's unit, at most ``long_edge`` pixels.
 
         Raises:
-            InputError: there are none at the path.
+            InputError: there are no images at the path.
         """
         return open_posed_source(self.path, InputConfig(long_edge=long_edge))
 
@@ -42,8 +42,8 @@ class TrueScene:
 def read_true_scene(path: Path) -> TrueScene:
     """Read true poses: a pose file, a folder with one, or any image set with known poses.
 
-    Of a data set with several cameras the poses are of the one whose folder of images is given,
-    else of the one that would be read of the sequence.
+    For a data set with several cameras, the poses are of the camera whose image folder is given,
+    else of the default camera of the sequence.
 
     Raises:
         InputError: there are no poses.

@@ -1,1 +1,1 @@
-"""When, and in which thread, the stages of SLAM run: in order, with the map at the end, or live."""
+"""Scheduling of the stages of SLAM: in order, with the map at the end, or live in threads."""

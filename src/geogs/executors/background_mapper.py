@@ -22,23 +22,23 @@ R = TypeVar("R")
 MAX_WAIT_SECONDS = 0.05
 """Longest wait of mapping between two parts of its work, while a frame is tracked."""
 MAX_WAITING = 12
-"""Waiting tasks from which on it does not wait, so as not to fall behind for ever; each keyframe
-makes two, and a correction another."""
+"""Waiting tasks above which mapping does not give way, so that it can catch up; each keyframe makes
+two tasks, and a correction one."""
 
 
 class BackgroundMapper:
-    """Does the tasks of a mapper in a thread, in the order in which they were given.
+    """Runs the tasks of a mapper in a thread, in order.
 
-    The thread's mapper has keyframes of its own: copies, which are brought up to date with each
-    task to what they were when it was given. So neither sees the other in the middle of its work,
-    and tracking only ever pays for the copying of references. On a GPU the thread has a stream of
-    its own, which gives way to the tracker's if that has a higher priority.
+    The thread's mapper has its own copies of keyframes; each task first updates them to their state
+    when the task was given. So neither thread sees the other in the middle of its work, and
+    tracking only copies references. On a GPU the thread has its own stream, which gives way to the
+    tracker's if that has a higher priority.
     """
 
     def __init__(
         self, keyframes: KeyframeTable, new_mapper: Callable[[KeyframeTable], Mapper]
     ) -> None:
-        """``new_mapper`` makes the mapper of a table of keyframes."""
+        """``new_mapper`` makes a mapper for a table of keyframes."""
         self._keyframes, self._mirror = keyframes, KeyframeMirror(keyframes)
         device = torch.device(keyframes.grid.device)
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
@@ -55,7 +55,7 @@ class BackgroundMapper:
         self._thread.start()
 
     def giving_way(self) -> AbstractContextManager[None]:
-        """While a frame is tracked, for whose pose somebody waits."""
+        """Return a context in which mapping gives way: a frame is being tracked."""
         return self._gate.taken()
 
     # --- tasks from tracking ---------------------------------------------------------------
@@ -83,9 +83,9 @@ class BackgroundMapper:
             torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
-        """An answer from the mapper as it is between two tasks.
+        """Return the answer of the mapper between two tasks.
 
-        Waits for the task that is under way, and for no other that was given before.
+        Waits for the running task, but not for other tasks given before.
         """
         answers: list[R] = []
         done = threading.Event()
@@ -107,7 +107,7 @@ class BackgroundMapper:
         return answers[0]
 
     def settled(self) -> Mapper:
-        """The mapper after all of its tasks, on the keyframes of the store; the thread ends."""
+        """End the thread after all tasks; return the mapper, on the original keyframes."""
         with self._news:
             self._is_closed = True
             self._news.notify()
@@ -163,7 +163,7 @@ class BackgroundMapper:
             self._gate.give()
 
     def _raise(self) -> None:
-        """What ended the thread, if anything did."""
+        """Raise the error that ended the thread, if any."""
         if isinstance(self._failure, GeogsError | torch.cuda.OutOfMemoryError):
             raise self._failure
         if self._failure is not None:
@@ -171,6 +171,6 @@ class BackgroundMapper:
 
 
 def wait_for(stream: "torch.cuda.Stream | None") -> None:
-    """Wait until a GPU has done what its stream was given; on a CPU nothing is left to do."""
+    """Wait until a GPU stream is done; on a CPU (None) do nothing."""
     if stream is not None:
         stream.synchronize()

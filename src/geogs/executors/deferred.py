@@ -1,4 +1,4 @@
-"""No map until the stream has ended, then one of all keyframes at their final poses."""
+"""Mapping after the stream has ended, from all keyframes at their final poses."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from geogs.mapping.map_all import map_all
 
 
 class Deferred(InOrder):
-    """In order, but for the map: made of all keyframes at once, which takes less time."""
+    """In order, except the map: made from all keyframes at once, which takes less time."""
 
     maps_at_end = True
 
@@ -17,7 +17,7 @@ class Deferred(InOrder):
         """Leave all keyframes unmapped."""
 
     def refine(self, unmapped: list[int], progress: Progress, seconds: float | None) -> None:
-        """Make the map of all keyframes; in limited ``seconds`` only if there is none yet."""
+        """Make the map from all keyframes; in limited ``seconds`` only if there is none yet."""
         if (seconds is not None and self.disks) or not (unmapped or self.disks):
             return
         with self.stopwatch("final mapping"):

@@ -1,4 +1,4 @@
-"""Stages one after the other, in the order of the frames; what other executors differ from."""
+"""Stages one after the other, in the order of the frames; base of the other executors."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -20,13 +20,13 @@ from geogs.world.segments import TrackState
 R = TypeVar("R")
 
 Advance = Callable[[TrackResult], None]
-"""Closes loops, moves the map and maps, as what tracking changed calls for it."""
+"""Closes loops, moves the map and maps, after what tracking changed."""
 Progress = Callable[[float], None]
 """Called with the finished fraction in [0, 1]."""
 
 
 class InOrder:
-    """Runs every stage at once, so that results depend on nothing but the frames."""
+    """Runs every stage at once, so that results depend only on the frames."""
 
     maps_at_end = False
     """Whether there is no map until the stream has ended."""
@@ -42,7 +42,7 @@ class InOrder:
     # --- a frame -----------------------------------------------------------------------------
 
     def frame(self) -> AbstractContextManager[object]:
-        """While somebody waits for the pose of a frame."""
+        """Return a context for the processing of a frame."""
         return nullcontext()
 
     def track(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
@@ -54,18 +54,18 @@ class InOrder:
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"] | None:
-        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        """Last known pose, world to camera, in whatever segment; None before the first."""
         return self.segments.current.T_cw
 
     def deviation(self) -> DeviationOf | None:
-        """Computes how well the last frame's pose is known; none without a pose."""
+        """Return a function for the last pose's standard deviations; None without a pose."""
         return self.segments.current.deviation()
 
     def settle(self) -> None:
-        """Wait for what the last frame began."""
+        """Wait for work that the last frame started."""
 
     def in_order(self) -> "InOrder":
-        """What runs the stages after the last frame; threads end."""
+        """End all threads; return the executor for the stages after the last frame."""
         return self
 
     def begin_anew(self, mapper: Mapper) -> None:
@@ -84,7 +84,8 @@ class InOrder:
     ) -> None:
         """Map keyframes with at least ``lag`` final successors, and refine ``active`` poses.
 
-        ``final`` became so just now, and ends ``unmapped``, from which go those that are mapped.
+        ``final`` are the newly final keyframes, the last of ``unmapped``. Mapped ones are removed
+        from ``unmapped``.
         """
         with self.stopwatch("mapping"):
             for id in final:
@@ -97,14 +98,14 @@ class InOrder:
             self._refine_poses(active)
 
     def _refine_poses(self, active: Sequence[int]) -> None:
-        """Let poses agree better with the map, once in so many keyframes."""
+        """Refine poses against the map, every ``pose_every`` keyframes."""
         config = self.mapper.config
         if config.pose_iterations and len(self.mapper.table.mapped) % config.pose_every == 0:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(active)
 
     def refine(self, unmapped: list[int], progress: Progress, seconds: float | None) -> None:
-        """Train the map over all keyframes; not in limited time, as there is a map already."""
+        """Train the map over all keyframes; not in limited time, as there already is a map."""
         if seconds is None and self.mapper.table.mapped and self.mapper.config.final_iterations:
             with self.stopwatch("final mapping"):
                 if self.mapper.keyframes.lens is not None:
@@ -113,5 +114,5 @@ class InOrder:
                 self.mapper.refine(progress)
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
-        """An answer from the mapper."""
+        """Return the answer of the mapper."""
         return question(self.mapper)

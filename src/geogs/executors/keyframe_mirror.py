@@ -1,4 +1,4 @@
-"""Copies of keyframes for another thread, each as it was when it was handed over."""
+"""Copies of keyframes for another thread, each in its state at the handover."""
 
 from collections.abc import Iterable, Sequence
 
@@ -13,7 +13,7 @@ Handover = Sequence[tuple[Keyframe, Float[Tensor, "4 4"]]]
 
 
 class KeyframeMirror:
-    """A table that follows another, but is changed by nobody else than who asks it to.
+    """A copy of a table that changes only by :meth:`update`.
 
     Fields of keyframes are replaced, never changed in place; so a copy of references is enough.
     """
@@ -24,14 +24,14 @@ class KeyframeMirror:
         """The copies, for the other thread."""
         self._copies = self.table.new_set()
         self._seen: dict[int, tuple[object, ...]] = {}
-        """What each keyframe that is followed was at the last handover."""
+        """State of each followed keyframe at the last handover."""
 
     def follow(self, ids: Iterable[int]) -> None:
-        """Copy these keyframes, too, from now on."""
+        """Also copy these keyframes from now on."""
         self._seen |= dict.fromkeys(ids, ())
 
     def changed(self) -> Handover:
-        """Copies of the keyframes that are not what they were at the last call."""
+        """Copy the keyframes that have changed since the last call."""
         changed = []
         for id, before in self._seen.items():
             keyframe = self._original[id]
@@ -42,7 +42,7 @@ class KeyframeMirror:
         return changed
 
     def update(self, changed: Handover, stream: "torch.cuda.Stream | None") -> None:
-        """Take over what changed, in the other thread, which works in a ``stream`` of a GPU."""
+        """Apply the changes, in the other thread, which works in a ``stream`` of a GPU."""
         for keyframe, T_cw in changed:
             keyframe.T_cw = T_cw
             if keyframe.id in self._copies:
@@ -55,6 +55,6 @@ class KeyframeMirror:
 
 
 def _parts(keyframe: Keyframe) -> tuple[object, ...]:
-    """All of a keyframe that is ever replaced."""
+    """Return all parts of a keyframe that are ever replaced."""
     k = keyframe
     return k.T_cw, k.inverse_depth, k.information, k.prior, k.scale, k.moving

@@ -1,4 +1,4 @@
-"""Frames at once, everything else in threads; results then depend on how fast the machine is."""
+"""Frames at once, everything else in threads; results then depend on the speed of the machine."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,8 +31,8 @@ R = TypeVar("R")
 class Live(InOrder):
     """Tracks in the caller's thread, completes keyframes in a second, and maps in a third.
 
-    While a keyframe is being completed frames are located at what it was; nobody else may touch
-    the segments then: :meth:`settle` comes first. On a GPU frames and keyframes share an urgent
+    While a keyframe is being completed, frames are located by its earlier state. Other code must
+    call :meth:`settle` before it uses the segments. On a GPU frames and keyframes share an urgent
     stream, to which that of mapping gives way.
     """
 
@@ -45,8 +45,8 @@ class Live(InOrder):
         new_mapper: Callable[[KeyframeTable], Mapper],
         stream: "torch.cuda.Stream | None",
     ) -> None:
-        """``new_mapper`` makes one of a copy of the keyframes; ``stream`` is the urgent one, in
-        which the segments' fields were made: see :func:`urgent_stream`."""
+        """``new_mapper`` makes a mapper for a copy of the keyframes; ``stream`` is the urgent one,
+        in which the segments' fields were made: see :func:`urgent_stream`."""
         super().__init__(segments, mapper, stopwatch, mask)
         self._stream = stream
         self.mapping = self._background = BackgroundMapper(mapper.keyframes, new_mapper)
@@ -58,12 +58,12 @@ class Live(InOrder):
 
     @contextmanager
     def frame(self) -> Iterator[None]:
-        """While somebody waits for the pose of a frame: mapping gives way."""
+        """Return a context for the processing of a frame, in which mapping gives way."""
         with self._background.giving_way(), torch.cuda.stream(self._stream):
             yield
 
     def track(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
-        """Locate a frame; what it brings beyond its pose is done in the other threads."""
+        """Locate a frame; all other work on it is done in the other threads."""
         with self.stopwatch("tracking"):
             if self._is_followed(frame):
                 return TrackState.TRACKING
@@ -76,7 +76,7 @@ class Live(InOrder):
             self._completion.start(partial(self._complete, tracked, advance))
         else:
             advance(tracked)
-            wait_for(self._stream)  # others may read what it has written
+            wait_for(self._stream)  # other threads may read what it has written
         return tracked.state
 
     @property
@@ -85,7 +85,7 @@ class Live(InOrder):
         return self._completion.is_going_on
 
     def _is_followed(self, frame: Frame) -> bool:
-        """Whether a frame was found while a keyframe is being completed."""
+        """Whether a frame was located while a keyframe is being completed."""
         if self._follower is None or not self.is_completing:
             return False
         return self._follower.follow(frame) is not None
@@ -98,15 +98,15 @@ class Live(InOrder):
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"] | None:
-        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        """Last known pose, world to camera, in whatever segment; None before the first."""
         return super().T_cw if self._follower is None else self._follower.T_cw
 
     def deviation(self) -> DeviationOf | None:
-        """Computes how well the last frame's pose is known; none without a pose."""
+        """Return a function for the last pose's standard deviations; None without a pose."""
         return super().deviation() if self._follower is None else self._follower.deviation()
 
     def settle(self) -> None:
-        """Wait for the keyframe, and take over the frames that were found meanwhile."""
+        """Wait for the keyframe, and take over the frames that were located meanwhile."""
         self._completion.wait()
         if self._follower is None:
             return
@@ -116,7 +116,7 @@ class Live(InOrder):
         wait_for(self._stream)
 
     def in_order(self) -> InOrder:
-        """What runs the stages after the last frame, on the map as the thread has made it."""
+        """End all threads; return the executor for the stages after the last frame."""
         with self.stopwatch("mapping"):
             mapper = self._background.settled()
         self._switching.end()
@@ -130,14 +130,14 @@ class Live(InOrder):
         return self._background.disks
 
     def _refine_poses(self, active: Sequence[int]) -> None:
-        """Poses stay the tracker's, which does not wait for the map."""
+        """Do nothing: tracking does not wait for the map."""
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
-        """An answer from the mapper, from its thread."""
+        """Return the answer of the mapper, from its thread."""
         return self._background.ask(question)
 
 
 def urgent_stream(device: str) -> "torch.cuda.Stream | None":
-    """A stream of a GPU whose work goes before that of others; none on a CPU."""
+    """Return a GPU stream of high priority; None on a CPU."""
     where = torch.device(device)
     return torch.cuda.Stream(where, priority=-1) if where.type == "cuda" else None

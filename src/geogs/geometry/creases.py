@@ -1,4 +1,4 @@
-"""Normals by which a mesh is smooth to look at, but for its edges."""
+"""Normals for smooth shading of a mesh except at its edges."""
 
 from typing import NamedTuple
 
@@ -6,28 +6,28 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 ANGLE = 30.0
-"""Degrees between a face and the mean normal of its corner, or between two faces, that are an
-edge."""
+"""Least angle of an edge, in degrees, between a face and the mean normal of its corner, or between
+two faces."""
 MOST = 0.3
-"""Part of the area around a vertex that has to be turned away so far: slivers make no edge."""
+"""Least fraction of the area around a vertex at such an angle: slivers make no edge."""
 _STEPS = 100
-"""Steps to a unit of a normal's coordinates; normals of the same steps count as one."""
+"""Quantisation steps per unit of a normal's coordinates; equal normals are merged."""
 
 
 class CreasedFaces(NamedTuple):
-    """Faces whose vertices are several where they meet at an edge, one for each side of it."""
+    """Faces whose vertices are split along edges, one for each side."""
 
     origin: Int[np.ndarray, "k"]
-    """Vertex that each was made of."""
+    """Original vertex of each."""
     faces: Int[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "k 3"]
-    """Float32, of length one; zero where there is no area."""
+    """Float32 unit normals; zero where there is no area."""
 
 
 def creased(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> CreasedFaces:
-    """Normals of a mesh at its vertices, of which there are more where it has an edge.
+    """Compute vertex normals of a mesh, with vertices split at its edges.
 
-    They are the means of the faces around, weighted by area; at an edge of those that lie alike.
+    They are area-weighted means over the adjacent faces; at an edge over those of similar normal.
     """
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     area = np.cross(b - a, c - a)
@@ -58,7 +58,7 @@ def _on_edges(
     means: Float[np.ndarray, "n 3"],
     limit: float,
 ) -> Bool[np.ndarray, "n"]:
-    """Vertices from whose mean normal much of what is around them is turned away."""
+    """Whether much of the area around a vertex deviates from its mean normal."""
     size = np.linalg.norm(area, axis=1)
     away, total = np.zeros(len(means)), np.zeros(len(means))
     for corner in faces.T:
@@ -74,9 +74,9 @@ def _means_of_alike(
     facing: Float[np.ndarray, "n 3"],
     limit: float,
 ) -> Float[np.ndarray, "n 3"]:
-    """Normal at each corner, in the order of its vertices, of the faces there that lie alike.
+    """Return the mean normal, at each corner, of the faces of similar normal at its vertex.
 
-    ``area`` are the faces' normals as long as they are large, ``facing`` of length one.
+    Corners are sorted by vertex; ``area``: face normals with length area, ``facing``: unit normals.
     """
     _, start, count = np.unique(vertex, return_index=True, return_counts=True)
     start, count = np.repeat(start, count), np.repeat(count, count)

@@ -13,14 +13,14 @@ from geogs.gpu.kernels import kernels_for
 _SOURCE = Path(__file__).parent / "cuda" / "depth.cu"
 _BLOCK = (32, 8)
 _LEAST_REACH = 1e-6
-"""Below which rounding alone tells pixels apart, and nothing would be averaged."""
+"""Least reach; below it pixels differ by rounding alone, and nothing would be averaged."""
 _ROUNDS = 2
 
 
 def normals_from_depth(
     depth: Float[Tensor, "h w"], camera: Camera
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Unit normals from central differences of the back-projected points.
+    """Compute unit normals from central differences of the back-projected points.
 
     The cross product is (right - left) x (top - bottom), so normals face the camera: the paper's
     Eq. depth_normal with the sign that makes its normal consistency zero at agreement. Valid where
@@ -45,15 +45,14 @@ def averaged_over_planes(
     radius: int,
     reach: float,
 ) -> Float[Tensor, "h w"]:
-    """Depth whose noise is averaged over the tangent planes of the pixels around.
+    """Smooth depth by averaging over the tangent planes of the pixels around.
 
     The plane through a pixel q with normal n has the inverse depth ``(n . r_p) / (z_q n . r_q)`` on
-    the ray of any pixel p, which is linear in p. A pixel takes the mean of what those within
-    ``radius`` say, itself included, each weighted by ``(1 - (e / reach)^2)^2`` (Tukey's biweight),
-    where e is its relative distance from what the pixel had before, and not at all beyond
-    ``reach``, nor beyond ``JUMP``; so planes stay as they are, however slanted, and steps stay
-    steps. Pixels without depth, and those that are seen at less than six degrees, stay as they are
-    and say nothing.
+    the ray of any pixel p, which is linear in p. A pixel gets the mean of these values over the
+    pixels within ``radius``, itself included, each weighted by ``(1 - (e / reach)^2)^2`` (Tukey's
+    biweight), where e is its relative difference from the pixel's old value, and zero beyond
+    ``reach`` or ``JUMP``. So planes do not change, however slanted, and steps stay steps. Pixels
+    without depth, and those seen at less than six degrees, do not change and are not used.
     """
     if reach < _LEAST_REACH:
         return depth
@@ -79,8 +78,8 @@ def averaged_once(
     radius: int,
     reach: float,
 ) -> Float[Tensor, "h w"]:
-    """One round of :func:`averaged_over_planes`: inverse depths, zero where there is none, and the
-    slopes of their planes per pixel to the right and down. Nothing is left where nobody says any.
+    """Run one round of :func:`averaged_over_planes` on inverse depths, zero where there is none,
+    and the slopes of their planes per pixel to the right and down. Zero where no pixel contributes.
     """
     height, width = inverse.shape
     before = torch.where(inverse > 0, 1 / inverse.clamp(min=1e-9), 0.0)
@@ -91,7 +90,7 @@ def averaged_once(
             here, there = _shifted(height, dy), _shifted(width, dx)
             p, q = (here[0], there[0]), (here[1], there[1])
             said = (above - dx * right)[q]
-            # Where either has no depth, e is -1 and the weight nothing.
+            # Where either has no depth, e is -1 and the weight is zero.
             e = (said * before[p]).sub_(1)
             weight = e.square_().mul_(-1 / reach**2).add_(1).clamp_(min=0).square_()
             top[p].addcmul_(weight, said)
@@ -106,7 +105,7 @@ def averaged_once_on_gpu(
     radius: int,
     reach: float,
 ) -> Float[Tensor, "h w"]:
-    """The same by a CUDA kernel, in float32."""
+    """Do the same by a CUDA kernel, in float32."""
     height, width = inverse.shape
     averaged = torch.empty_like(inverse)
     grid = (-(-width // _BLOCK[0]), -(-height // _BLOCK[1]))
@@ -116,5 +115,5 @@ def averaged_once_on_gpu(
 
 
 def _shifted(size: int, by: int) -> tuple[slice, slice]:
-    """The positions that have one so much farther on, and those that lie there."""
+    """Return the positions that have a neighbour ``by`` farther on, and those neighbours."""
     return slice(max(0, -by), size - max(0, by)), slice(max(0, by), size - max(0, -by))

@@ -1,4 +1,4 @@
-"""How far matches lie from the epipolar geometry of two views whose poses are known."""
+"""Distances of matches from the epipolar geometry of two views with known poses."""
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -10,15 +10,15 @@ def epipolar_distance(
     one: Float64[np.ndarray, "n 3"],
     two: Float64[np.ndarray, "n 3"],
 ) -> Float64[np.ndarray, "n"]:
-    """Sampson's first-order distance to x2^T F x1 = 0 (Hartley and Zisserman, eq. 11.9).
+    """Return Sampson's first-order distance to x2^T F x1 = 0 (Hartley and Zisserman, eq. 11.9).
 
-    Without any translation between the views: the distance from where the rotation takes x1.
+    Without translation between the views: the distance from x1 moved by the rotation.
 
     Args:
         T: from the first camera to the second.
         K_inverse: from points (x, y, 1) of both to rays; the identity where they are rays.
         one: points of the first view.
-        two: where they were found in the second, in whose unit the distance is.
+        two: their matches in the second, in whose unit the distance is.
     """
     t = T[:3, 3]
     length = np.linalg.norm(t)
@@ -41,14 +41,14 @@ def in_front_of_both(
 ) -> Bool[np.ndarray, "n"]:
     """Whether rays come nearest to each other in front of both cameras (cheirality).
 
-    The epipolar geometry is the same where a camera is turned half around the line to the other
+    The epipolar geometry does not change if a camera is rotated by half a turn about the baseline
     (Hartley and Zisserman, 9.6.3).
 
     Args:
         T: from the first camera to the second.
         one: rays of the first view.
-        two: those that they were found at in the second.
-        parallel: angle, radians, below which rays count as such: what they see is far away.
+        two: their matches in the second.
+        parallel: angle, radians, below which rays count as parallel: their point is far away.
     """
     a, b = one @ T[:3, :3].T, two
     aa, bb, ab = ((x * y).sum(axis=1) for x, y in ((a, a), (b, b), (a, b)))
@@ -58,5 +58,5 @@ def in_front_of_both(
 
 
 def homogeneous(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
-    """(x, y, 1)."""
+    """Return (x, y, 1)."""
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)

@@ -1,4 +1,4 @@
-"""Normals of single pixels of a depth map, by planes through the depths around them."""
+"""Normals of single pixels of a depth map, from planes fitted to the depths around."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,14 +8,14 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import minmod_slopes
 
 _REACHES = (0.06, 0.03, 0.02)
-"""Relative difference of inverse depths beyond which a pixel is of another surface, round by round:
-slopes of single pixels, which the first begins with, are noisy."""
+"""Relative difference of inverse depths beyond which a pixel is on another surface, round by round:
+slopes of single pixels, from which the first starts, are noisy."""
 _LEAST_SHARE = 0.3
-"""Part of the weight around a pixel that its plane has to explain."""
+"""Least fraction of the weight around a pixel that its plane has to explain."""
 _LEAST_WEIGHT = 2.0
-"""... and how much of it at least: three pixels would fit any noise."""
+"""Least weight that it has to explain: three pixels would fit any noise."""
 _RIDGE = 1e-6
-"""Keeps the plane of pixels that lie in one line from being singular."""
+"""Regularises the plane of pixels that lie on one line."""
 
 
 def fitted_normals(
@@ -25,13 +25,13 @@ def fitted_normals(
     pixels: tuple[Int[Tensor, "n"], Int[Tensor, "n"]],
     radius: int,
 ) -> Float[Tensor, "n 3"]:
-    """Unit normals at some pixels (rows and columns), each of a plane fitted to the depths around.
+    """Compute unit normals at some pixels (rows, columns), each of a plane fitted to nearby depths.
 
-    Inverse depth is linear in u and v along a plane, so that a fit over pixels leans no more where
-    a surface is seen at a slant than where it faces the camera; of points in space the nearest lie
-    along one row of the image there. The pixels within ``radius`` count by their ``weight``, those
-    without depth (0) not at all. Normals are in the camera's frame and face the camera; they are
-    zero where no plane explains three tenths of the weight around, or more than two pixels.
+    Inverse depth is linear in u and v along a plane, so a fit over pixels is as good on slanted
+    surfaces as on those facing the camera; nearest neighbours in space would lie along one image
+    row there. Pixels within ``radius`` count by their ``weight``, those without depth (0) not at
+    all. Normals are in the camera's frame and face the camera; they are zero where no plane
+    explains three tenths of the weight around, or more than two pixels.
     """
     v, u = pixels
     inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), 0.0)
@@ -58,8 +58,8 @@ def _robust_planes(
     offsets: Float[Tensor, "k 3"],
     plane: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Planes ``offsets @ plane`` of inverse depths over their own, near 1, by weighted least
-    squares with Tukey's biweight, renewed from the first on, and whether they explain enough."""
+    """Fit planes ``offsets @ plane`` to inverse depths relative to the pixel's own, near 1, by
+    reweighted least squares (Tukey's biweight); return them and whether they explain enough."""
     products = (offsets[:, :, None] * offsets[:, None]).flatten(1)
     ridge = _RIDGE * torch.eye(3, dtype=values.dtype, device=values.device)
     total = counts.sum(1)
@@ -70,7 +70,7 @@ def _robust_planes(
         explained = fit.sum(1)
         is_plane = (explained > _LEAST_SHARE * total) & (explained > _LEAST_WEIGHT)
         system = (fit @ products).unflatten(1, (3, 3)) + ridge
-        # Without a check of its errors, for which a GPU would be waited for.
+        # No check of its errors, which would wait for a GPU.
         solution, _ = torch.linalg.solve_ex(system, (fit * values) @ offsets)
         plane = torch.where(is_plane[:, None], solution, plane)
     return plane, is_plane

@@ -1,4 +1,4 @@
-"""Poses as programs give them: of NumPy or PyTorch, on any device."""
+"""Poses given by programs, as NumPy arrays or PyTorch tensors on any device."""
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ GivenPose = Float[Tensor, "4 4"] | Float[np.ndarray, "4 4"]
 
 
 def as_pose(T_cw: GivenPose) -> Float64[Tensor, "4 4"]:
-    """A given pose on the CPU. Raises InputError if it is none."""
+    """Copy a given pose to the CPU. Raises InputError if it is none."""
     try:
         pose = torch.as_tensor(T_cw, dtype=torch.float64, device="cpu").detach()
     except (TypeError, ValueError, RuntimeError):

@@ -1,4 +1,4 @@
-"""Where a depth map jumps from one surface to another, and how it goes on where it does not."""
+"""Depth discontinuities between surfaces, and slopes of inverse depth within them."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 JUMP = 0.04
-"""Least jump of depth, as a part of the farther depth: 1 - near / far."""
+"""Least jump of depth, as a fraction of the farther depth: 1 - near / far."""
 
 
 class DepthJumps(NamedTuple):
@@ -22,16 +22,16 @@ class DepthJumps(NamedTuple):
     """Ends on the farther surface."""
 
     def around(self, reach: int) -> Bool[Tensor, "h w"]:
-        """Pixels at most so many rows and columns from an end."""
+        """Return the pixels at most ``reach`` rows and columns from an end."""
         return widened(self.near | self.far, reach)
 
 
 def depth_jumps(depth: Float[Tensor, "h w"]) -> DepthJumps:
-    """Jumps of a depth map that no plane explains.
+    """Find jumps of a depth map that no plane explains.
 
-    Inverse depth is linear along a plane: of the step between two pixels what is left without the
-    slope before, or without the slope after, has to exceed ``JUMP``. Pixels without depth (0 or
-    less) end no jump.
+    Inverse depth is linear along a plane: the step between two pixels has to exceed ``JUMP`` after
+    subtracting the slope before it, and also the slope after it. Pixels without depth (0 or less)
+    end no jump.
     """
     inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), torch.nan)
     across, down = _ends(inverse), DepthJumps(*(ends.mT for ends in _ends(inverse.mT)))
@@ -39,7 +39,7 @@ def depth_jumps(depth: Float[Tensor, "h w"]) -> DepthJumps:
 
 
 def _ends(inverse: Float[Tensor, "h w"]) -> DepthJumps:
-    """Along rows; comparisons with what is unknown are false."""
+    """Find jumps along rows; comparisons with unknown values are false."""
     step = inverse.diff(dim=1)
     before = F.pad(step[:, :-1], (1, 0), value=torch.inf)
     after = F.pad(step[:, 1:], (0, 1), value=torch.inf)
@@ -52,7 +52,7 @@ def _ends(inverse: Float[Tensor, "h w"]) -> DepthJumps:
 
 
 def widened(mask: Bool[Tensor, "h w"], reach: int) -> Bool[Tensor, "h w"]:
-    """The mask and what is at most so many rows and columns from it."""
+    """Dilate a mask by ``reach`` rows and columns."""
     if reach < 1:
         return mask
     side = 2 * reach + 1
@@ -66,9 +66,9 @@ def widened(mask: Bool[Tensor, "h w"], reach: int) -> Bool[Tensor, "h w"]:
 def minmod_slopes(
     inverse: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Differences of inverse depth per pixel to the right and down, which reach across no jump.
+    """Return differences of inverse depth per pixel to the right and down, not across jumps.
 
-    Each is the smaller of those to the two neighbours, zero where they disagree in sign or a
+    Each is the smaller of the differences to the two neighbours, zero where their signs differ or a
     neighbour is not valid (minmod).
     """
     right, down = (_minmod(*maps) for maps in ((inverse, valid), (inverse.mT, valid.mT)))

@@ -1,9 +1,8 @@
-"""The one least-squares loop: damped Gauss-Newton and Levenberg-Marquardt, whatever is adjusted.
+"""The common least-squares loop: damped Gauss-Newton and Levenberg-Marquardt for any problem.
 
 A problem is two functions, one that linearises it at a state and one that takes a damped step from
-there; a policy says which steps are taken, how the damping follows them, and when it is enough.
-States and their arrays are the problem's own: poses and depths, a lens, the points of a clip, on
-any device.
+there; a policy controls the steps, the damping and the end. States and their arrays belong to the
+problem: poses and depths, a lens, the points of a clip, on any device.
 """
 
 import math
@@ -15,69 +14,69 @@ from typing import Generic, TypeVar
 S = TypeVar("S")
 """A state."""
 L = TypeVar("L")
-"""A problem linearised at one."""
+"""A problem linearised at a state."""
 
 
 @dataclass(frozen=True)
 class Step(Generic[S]):
-    """Where a step leads."""
+    """Result of a step."""
 
     state: S
     size: float = math.inf
-    """Largest move of the state; infinite where nothing is to end by it."""
+    """Largest change of the state; infinite if it is not used to stop."""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """Which steps are taken, and when it is enough.
+    """Acceptance of steps, damping and stopping criteria.
 
-    Without the fields of the second half, and without a cost: Gauss and Newton's method, with the
+    Without the fields of the second half, and without a cost: the Gauss-Newton method, with the
     same damping in all steps.
     """
 
     max_steps: int = sys.maxsize
-    """Steps that are taken at most."""
+    """Largest number of accepted steps."""
     damping: float = 0.0
-    """At the start."""
+    """Damping at the start."""
     tolerance: float = 0.0
-    """A step of a smaller size that is taken is the last one."""
+    """Step size below which an accepted step is the last one."""
 
     max_trials: int = sys.maxsize
-    """Steps that are tried at most, taken or not."""
+    """Largest number of steps tried, accepted or not."""
     max_damping: float = math.inf
     """Damping beyond which no step is tried."""
     least_damping: float = 0.0
     """Damping below which it does not fall."""
     least_raised: float = 0.0
-    """Damping from which it rises at least."""
+    """Least damping from which it is raised."""
     retries_unsolvable: bool = False
-    """Whether equations without a solution are damped more; otherwise they are the end."""
+    """Whether equations without a solution are damped more; otherwise they end the loop."""
     least_decrease: float = 0.0
     """Fraction of the cost; a step that lowers it by no more is the last one."""
     is_of_new_cost: bool = False
     """Whether that is a fraction of the cost after the step, not before it."""
     costs_anew: bool = False
-    """Whether the residuals that count depend on where the problem was linearised. Then the cost
-    after a step is what it is once that is done anew."""
+    """Whether the active residuals depend on where the problem was linearised. Then the cost after
+    a step is computed after linearising again."""
     enough: float = 0.0
-    """Cost below which there is nothing left to gain."""
+    """Cost below which the loop ends."""
     stall: float = -math.inf
-    """Nor is there if a step raises the cost by no more than this fraction."""
+    """Relative rise of the cost up to which a rejected step ends the loop."""
 
 
 @dataclass(frozen=True)
 class Solution(Generic[S, L]):
-    """Where the loop ended."""
+    """Result of the loop."""
 
     state: S
     linear: L | None
     """The problem linearised at the state; None where that was not needed."""
     cost: float
-    """Not a number without one."""
+    """Final cost; NaN without a cost function."""
     steps: int
-    """Taken."""
+    """Number of accepted steps."""
     finite: bool
-    """Whether the last equations had a solution, or were damped until they had."""
+    """Whether the last equations had a solution, if need be with more damping."""
 
 
 def minimise(
@@ -87,16 +86,16 @@ def minimise(
     policy: Policy,
     cost: Callable[[S, L], float] | None = None,
 ) -> Solution[S, L]:
-    """Take steps from a state on.
+    """Minimise from a state on.
 
     Args:
-        start: the state.
-        linearise: gives the normal equations at a state.
-        step: gives the solution of these with a damping; None where there is no finite one.
-        policy: which steps are taken.
-        cost: of a state, over the residuals that count where the problem was linearised. With one
-            only steps that lower it are taken (Levenberg and Marquardt): damping falls tenfold with
-            each of these and rises tenfold with each other. Without one all are taken.
+        start: the initial state.
+        linearise: returns the normal equations at a state.
+        step: solves them with a damping; None where there is no finite solution.
+        policy: steps, damping and end.
+        cost: of a state, over the residuals active at the linearisation. With a cost only steps
+            that lower it are accepted (Levenberg-Marquardt): damping falls tenfold with each of
+            these and rises tenfold with each other. Without one all steps are accepted.
     """
     state, damping = start, policy.damping
     linear: L | None = None

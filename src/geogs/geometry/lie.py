@@ -1,8 +1,8 @@
 """SO(3), SE(3) and Sim(3) as batched matrices: exp, log, inverse, adjoint, retraction.
 
 Elements are plain matrices, so composition is ``@`` and a batch is a leading dimension. Tangents
-are ``[tau(3), phi(3)(, sigma(1))]``. Every function is differentiable everywhere, zero included,
-and the logarithms hold up to (not at) a half turn.
+are ``[tau(3), phi(3)(, sigma(1))]``. Every function is differentiable everywhere, including zero,
+and the logarithms are valid up to (not at) a half turn.
 """
 
 import torch
@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from geogs.geometry.sim3_translation import TranslationMap, halvings_of
 
-# Size of a tangent's adjoint up to which eight terms of a series give all digits.
+# Size of a tangent's adjoint up to which eight terms of the series are exact to all digits.
 _NEAR_ZERO = 0.25
 # Below this squared angle the closed forms lose digits and a Taylor series takes over.
 _SMALL = {torch.float64: 1e-4, torch.float32: 1e-3}
@@ -70,7 +70,7 @@ def _left_jacobian(phi: Tensor) -> Tensor:
 
 def _compose(linear: Tensor, translation: Tensor) -> Tensor:
     top = torch.cat([linear, translation[..., None]], -1)
-    # Numbers of the host would have to wait for a GPU.
+    # Host values would have to wait for a GPU.
     row = pad(torch.ones_like(top[..., :1, :1]), (3, 0))
     return torch.cat([top, row], -2)
 
@@ -184,8 +184,7 @@ def sim3_left_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
 def sim3_inverse_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
     """The inverse of :func:`sim3_left_jacobian`.
 
-    Near zero, where most errors are, by its own series, whose coefficients are Bernoulli's numbers:
-    a third of the work.
+    Near zero, where most errors are, by its own series with Bernoulli numbers: a third of the work.
     """
     ad = sim3_small_adjoint(xi)
     far = ad.detach().abs().sum(-1).amax(-1) > _NEAR_ZERO

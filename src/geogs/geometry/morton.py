@@ -1,14 +1,11 @@
-"""Order of cells along the Z-order curve, in which neighbours in space are mostly near."""
+"""Order of cells along the Z-order curve, which keeps most spatial neighbours close."""
 
 import numpy as np
 from jaxtyping import Int, Shaped
 
 
 def morton_codes(cells: Shaped[np.ndarray, "n 3"], bits: int) -> Int[np.ndarray, "n"]:
-    """Places along the curve: the bits of the three whole, non-negative coordinates interleaved.
-
-    At most 21 bits each.
-    """
+    """Interleave the bits of the three whole, non-negative coordinates, at most 21 bits each."""
     code = np.zeros(len(cells), np.int64)
     for bit in range(bits):
         for axis in range(3):

@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.gpu.kernels import kernels_for
 
 MAX_GPU_NEIGHBORS = 32
-"""On a GPU a lane of a warp holds one neighbour."""
+"""Most neighbours on a GPU: each lane of a warp holds one."""
 _SOURCE = Path(__file__).parent / "cuda" / "neighbors.cu"
 _QUERIES_PER_BLOCK = 8
 
@@ -17,11 +17,11 @@ _QUERIES_PER_BLOCK = 8
 def nearest_neighbors(
     queries: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"], k: int
 ) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Distances and indices of the ``min(k, m)`` nearest points, nearest first.
+    """Return distances and indices of the ``min(k, m)`` nearest points, nearest first.
 
     A query that is itself one of the points finds itself first, at distance zero. Exact: a k-d
     tree on the CPU; on a GPU all pairs in float32 without waiting for the device (so points that
-    differ in distance by less than 1e-7 of it may change places), for up to 32 neighbours.
+    differ in distance by less than 1e-7 of it may be swapped), for up to 32 neighbours.
     """
     k = min(k, len(points))
     if queries.device.type == "cuda" and 0 < k <= MAX_GPU_NEIGHBORS:
@@ -39,7 +39,7 @@ def nearest_neighbors(
 def all_pairs_neighbors(
     queries: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"], k: int
 ) -> Int[Tensor, "n k"]:
-    """Indices of the k nearest points by the CUDA kernel, nearest first; 1 <= k <= min(m, 32)."""
+    """Find the k nearest points by the CUDA kernel, nearest first; 1 <= k <= min(m, 32)."""
     if not 1 <= k <= min(len(points), MAX_GPU_NEIGHBORS):
         raise ValueError(f"{k} neighbours of {len(points)} points")
     kernel = kernels_for(_SOURCE, queries.device)["nearest_neighbors"]

@@ -1,4 +1,4 @@
-"""What makes the translation of a similarity of its tangent: the logarithm's costliest part."""
+"""Map from the tangent of a similarity to its translation: the costliest part of the logarithm."""
 
 import math
 
@@ -14,7 +14,7 @@ class TranslationMap:
     """V with translation = V tau: the integral of exp(s (sigma I + K)) over s in [0, 1], K the
     cross product with phi.
 
-    As K^3 = -theta^2 K, all such matrices are a I + b K + c K^2, and three numbers stand for each.
+    As K^3 = -theta^2 K, all such matrices are a I + b K + c K^2, stored as three numbers each.
     """
 
     def __init__(self, phi: Float[Tensor, "*b 3"], sigma: Float[Tensor, "*b"]) -> None:
@@ -36,11 +36,11 @@ class TranslationMap:
         self._v = v
 
     def __matmul__(self, tau: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """V tau."""
+        """Return V tau."""
         return self._apply(self._v, tau)
 
     def solve(self, t: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """V^-1 t."""
+        """Return V^-1 t."""
         a, b, c = self._v
         p = a - self._square * c
         determinant = p.square() + self._square * b.square()
@@ -63,6 +63,6 @@ class TranslationMap:
 
 
 def halvings_of(size: Tensor) -> int:
-    """How often matrices of these sizes are halved before a series of theirs is summed."""
+    """Return how often matrices of these sizes are halved before summing their series."""
     most = float(size.max()) if size.numel() else 0.0
     return max(0, math.ceil(math.log2(most / 0.5))) if 0.5 < most < math.inf else 0

@@ -1,4 +1,4 @@
-"""The similarity between two point sets in closed form."""
+"""Similarity between two point sets in closed form."""
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from geogs.errors import GeogsError
 def umeyama(
     source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], with_scale: bool = True
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """Least-squares ``scale, R, t`` with ``target = scale R source + t`` (Umeyama 1991).
+    """Return least-squares ``scale, R, t`` with ``target = scale R source + t`` (Umeyama 1991).
 
     Raises GeogsError if there are fewer than three points or they lie on one point or line, where
     the rotation is not determined.

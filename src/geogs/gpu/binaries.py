@@ -12,11 +12,11 @@ from geogs.gpu.cache import cache_key
 from geogs.gpu.kernel_source import OPTIONS, read_source
 
 FOLDER = Path(__file__).with_name("compiled")
-"""An archive for each architecture; the name of its entries is a hash of the source."""
+"""Folder with an archive for each architecture; the entries' names are hashes of the sources."""
 MACHINE_CODE = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-"""Each runs on GPUs of the same major and the same or a higher minor compute capability."""
+"""Architectures; each runs on GPUs of the same major and no lower minor compute capability."""
 PTX = "compute_75"
-"""Translated by the driver of every later GPU."""
+"""Architecture of the PTX, which the driver of every later GPU translates."""
 
 
 def shipped_code(text: str, capability: tuple[int, int]) -> Iterator[bytes]:
@@ -26,7 +26,7 @@ def shipped_code(text: str, capability: tuple[int, int]) -> Iterator[bytes]:
         try:
             with zipfile.ZipFile(archive) as codes:
                 yield codes.read(name_of(text))
-        except (OSError, KeyError, zipfile.BadZipFile, zlib.error):  # none, of others, or damaged
+        except (OSError, KeyError, zipfile.BadZipFile, zlib.error):  # none, others, or damaged
             continue
 
 
@@ -39,12 +39,12 @@ def usable_by(capability: tuple[int, int]) -> list[str]:
 
 
 def name_of(text: str) -> str:
-    """Name of an entry: another text, or other options, have another."""
+    """Name of a source's entry, which depends on its text and the options."""
     return cache_key(text, *OPTIONS)
 
 
 def shipped_sources(sources: Iterable[Path]) -> dict[str, int]:
-    """How many of the sources, as they are now, are shipped for each architecture."""
+    """Number of the sources that are shipped in their current form, for each architecture."""
     names = [name_of(read_source(source)) for source in sources]
     counts = {}
     for architecture in (*MACHINE_CODE, PTX):

@@ -1,7 +1,7 @@
 """Compile the kernels that a release ships, on any machine.
 
 ``python -m geogs.gpu.build_binaries`` needs NVRTC (``pip install nvidia-cuda-nvrtc``), but neither
-a GPU nor a driver. What the oldest CUDA of a major version compiles, all its drivers load.
+a GPU nor a driver. All drivers of a major version of CUDA load code compiled by its oldest release.
 """
 
 import os
@@ -16,13 +16,13 @@ from geogs.gpu.kernel_source import OPTIONS, PACKAGE, kernel_sources, read_sourc
 from geogs.gpu.nvrtc import Nvrtc, load_nvrtc
 
 CUDA = "13"
-"""Major version; its drivers, and all later ones, load what it makes."""
+"""Major version; its drivers, and all later ones, load its code."""
 
 
 def build(compiler: Nvrtc, sources: list[Path], folder: Path = FOLDER) -> int:
-    """Write an archive for each architecture with all sources; the bytes of all archives.
+    """Write an archive for each architecture with all sources; return their size in bytes.
 
-    Raises DeviceError with the compiler's words if a source has errors.
+    Raises DeviceError with the compiler's message if a source has errors.
     """
     folder.mkdir(exist_ok=True)
     texts = {source: read_source(source) for source in sources}
@@ -35,7 +35,7 @@ def build(compiler: Nvrtc, sources: list[Path], folder: Path = FOLDER) -> int:
             path = folder / f"{architecture}.zip"
             with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
                 for text, code in zip(texts.values(), codes, strict=True):
-                    # of no date, so that the same sources make the same file
+                    # without a date, so that the same sources make the same file
                     entry = zipfile.ZipInfo(name_of(text))
                     archive.writestr(entry, code, zipfile.ZIP_DEFLATED, 9)
             size += path.stat().st_size
@@ -43,7 +43,7 @@ def build(compiler: Nvrtc, sources: list[Path], folder: Path = FOLDER) -> int:
 
 
 def main() -> int:
-    """Build for all packages beside this one; the exit code."""
+    """Build for all packages beside this one; return the exit code."""
     sources = kernel_sources(PACKAGE.parent)
     try:
         compiler = load_nvrtc(CUDA)

@@ -15,10 +15,10 @@ class CacheState:
     """Kernels in the cache, and whether more can be written."""
 
     kernels: int
-    """Compiled source files."""
+    """Number of compiled source files."""
     bytes: int
     problem: str | None
-    """Why nothing can be written, None if it can."""
+    """Reason why nothing can be written; None if it can."""
 
 
 def cache_folder() -> Path:
@@ -27,7 +27,7 @@ def cache_folder() -> Path:
         return Path(chosen)
     base = os.environ.get("XDG_CACHE_HOME")
     home = os.path.expanduser("~")
-    if not base and not os.path.isabs(home):  # nobody knows this user
+    if not base and not os.path.isabs(home):  # a user without a home directory
         return Path(tempfile.gettempdir()) / f"geogs-{os.getuid()}"
     return (Path(base) if base else Path(home) / ".cache") / "geogs"
 
@@ -48,7 +48,7 @@ def read_cubin(key: str) -> bytes | None:
 
 
 def write_cubin(key: str, cubin: bytes) -> bool:
-    """Keep a cubin, atomically, whoever else writes it. False if it cannot be written."""
+    """Store a cubin atomically, even if others write it, too. False if it cannot be written."""
     path = _path(key)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,7 @@ def write_cubin(key: str, cubin: bytes) -> bool:
 
 
 def cache_state() -> CacheState:
-    """Look into the cache, and try to write there."""
+    """Count the kernels in the cache, and try to write there."""
     folder = _kernel_folder()
     files = list(folder.glob("*.cubin"))
     problem = None

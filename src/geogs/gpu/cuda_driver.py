@@ -28,7 +28,7 @@ _FORMATS = {"int": "i4x", "unsigned": "I4x", "float": "f4x", "double": "d", "lon
 def _driver() -> tuple[ctypes.CDLL, ctypes.PyDLL]:
     """The driver for calls that may take long, and once more for launches.
 
-    A PyDLL keeps the interpreter lock: giving it away takes longer than a launch.
+    A PyDLL keeps the interpreter lock: releasing it takes longer than a launch.
     """
     try:
         return ctypes.CDLL("libcuda.so.1"), ctypes.PyDLL("libcuda.so.1")

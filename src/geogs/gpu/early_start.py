@@ -10,8 +10,8 @@ from pathlib import Path
 def start_gpu(name: str) -> None:
     """Initialise the GPU of a device's name in a thread; ``auto`` is the first.
 
-    PyTorch finds it as it is, or makes it ready itself. Nothing is done where PyTorch has no CUDA,
-    and nothing is said where it fails: who uses the GPU says it.
+    PyTorch then finds it initialised, or initialises it itself. Nothing is done if PyTorch has no
+    CUDA. A failure is not reported here, but at the first use of the GPU.
     """
     device, _, index = name.partition(":")
     if device in ("auto", "cuda") and (index or "0").isdecimal() and _has_cuda():

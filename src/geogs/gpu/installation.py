@@ -1,4 +1,4 @@
-"""CUDA on this machine, found out without starting a GPU."""
+"""State of CUDA on this machine, determined without starting a GPU."""
 
 import ctypes
 import functools
@@ -26,7 +26,7 @@ def driver_cuda() -> tuple[int, int] | None:
 
 
 def driver_release() -> str | None:
-    """The driver's own version such as 580.65.06; None where it does not say."""
+    """The driver's own version such as 580.65.06; None if it cannot be read."""
     try:
         management = ctypes.CDLL("libnvidia-ml.so.1")
     except OSError:
@@ -44,7 +44,7 @@ def driver_release() -> str | None:
 def gpu_problem() -> str | None:
     """One sentence on why PyTorch cannot use an NVIDIA GPU here and what to do, None if it can."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # PyTorch's own words on an old driver; ours follow
+        warnings.simplefilter("ignore")  # PyTorch's own message on an old driver; ours follows
         available = torch.version.cuda is not None and torch.cuda.is_available()
     if available:
         return None

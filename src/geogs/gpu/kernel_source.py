@@ -1,13 +1,13 @@
-"""Kernel sources: where they are, what they include and which kernels they define."""
+"""Kernel sources: their files, their includes and the kernels that they define."""
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-"""Holds all kernel sources of ours."""
+"""Folder with all kernel sources of ours."""
 INCLUDE_FOLDER = Path(__file__).parent
-"""Holds ``#include "common.cuh"``."""
+"""Folder of ``#include "common.cuh"``."""
 OPTIONS = ("--use_fast_math", "--std=c++17")
 """Compiler options of all kernels; whatever else they depend on is an argument of the launch."""
 

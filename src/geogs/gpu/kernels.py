@@ -34,7 +34,7 @@ def kernels_for(source: Path, device: torch.device) -> Mapping[str, Kernel]:
 
 
 def prepare_kernels(folder: Path, device: torch.device) -> int:
-    """Compile or load every source below ``folder`` now, many at once; the number of kernels.
+    """Compile or load every source below ``folder`` now, many at once; return the kernel count.
 
     Otherwise each would be compiled when it is first used. Raises as :func:`kernels_for` does.
     """
@@ -60,7 +60,7 @@ def _device_kernels(source: Path, index: int) -> Mapping[str, Kernel]:
     except DeviceError:
         if read_cubin(key) is None:
             raise
-    # The cached file may be what is wrong.
+    # The cached file may be damaged.
     return load_kernels(compile_cubin(text, source.name, f"sm_{major}{minor}"), signatures, index)
 
 

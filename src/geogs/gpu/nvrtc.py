@@ -13,7 +13,7 @@ from geogs.errors import DeviceError
 
 
 class Nvrtc:
-    """CUDA C++ in, machine code (cubin) or PTX out."""
+    """Compiler from CUDA C++ to machine code (cubin) or PTX."""
 
     def __init__(self, path: str) -> None:
         library = ctypes.CDLL(path)
@@ -27,7 +27,7 @@ class Nvrtc:
     def compile(self, source: str, name: str, architecture: str, options: Sequence[str]) -> bytes:
         """The cubin of a source for ``sm_90``, its PTX for ``compute_90``.
 
-        Raises DeviceError with the compiler's words if it has errors.
+        Raises DeviceError with the compiler's message if it has errors.
         """
         rtc, program = self._library, ctypes.c_void_p()
         self._check(
@@ -83,7 +83,7 @@ def _candidates(cuda_major: str) -> list[str]:
     spec = importlib.util.find_spec("torch")
     if spec is not None and spec.origin is not None:
         folders += [Path(spec.origin).parents[1] / "nvidia", Path(spec.origin).parent / "lib"]
-    # Only where packages have it: a walk through all that NVIDIA's hold takes seconds.
+    # Only the folders that packages use: a walk through all of NVIDIA's takes seconds.
     places = [name, f"*/lib/{name}"]
     found = [str(p) for f in folders for place in places for p in sorted(f.glob(place))]
     return list(dict.fromkeys(found + sorted(glob.glob(f"/usr/local/cuda*/lib64/{name}"))))

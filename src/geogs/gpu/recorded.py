@@ -1,4 +1,4 @@
-"""Work on a GPU recorded as a CUDA graph: its many launches cost the CPU one."""
+"""Work on a GPU recorded as a CUDA graph: its many launches cost the CPU a single one."""
 
 import gc
 import logging
@@ -38,16 +38,16 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
 
 
 class Recorded:
-    """Does ``work``, whose control flow may not depend on the values of its tensors.
+    """Runs ``work``, whose control flow may not depend on the values of its tensors.
 
     On a GPU it is recorded as a CUDA graph at the second call with tensors of the same shapes, and
     replayed from then on: in the first call libraries still choose their kernels, and shapes that
-    come only once are not worth it. Elsewhere, and where a driver cannot record it, it is called as
-    it is. Threads and streams may share one: each waits until what another has begun is done.
+    come only once are not worth it. Elsewhere, and where a driver cannot record it, it is called
+    directly. Threads and streams may share one: each waits until the calls before are done.
     """
 
     def __init__(self, work: Callable[..., Maps], name: str) -> None:
-        """``name`` stands in the warning where it cannot be recorded."""
+        """``name`` is used in the warning if it cannot be recorded."""
         self._work, self._name = work, name
         self._done_once = set[tuple[torch.Size, ...]]()
         self._recordings: dict[tuple[torch.Size, ...], Callable[..., Maps]] = {}

@@ -14,7 +14,7 @@ def to_device(
     """The tensor on the device; a copy from the host to a GPU is only enqueued.
 
     It goes through pinned memory, which PyTorch keeps until the copy is done. From ordinary memory
-    a driver may read later than it says, when a temporary source has been overwritten.
+    a driver may read after the call has returned, when a temporary source is already overwritten.
     """
     if device.type == "cuda" and tensor.device.type == "cpu":
         tensor = tensor if dtype is None else tensor.to(dtype)

@@ -1,4 +1,4 @@
-"""Catch what decoders of pictures, which are C libraries, print on the standard error."""
+"""Catch messages of picture decoders, which are C libraries, on the standard error."""
 
 import os
 import threading
@@ -8,13 +8,13 @@ from contextlib import contextmanager, suppress
 _WORDS = (
     "jpeg", "png", "tiff", "webp", "opencv", " warn:", " error:", "bmp", "exif", "iccp", "cv::",
 )  # fmt: skip
-"""Words by which lines of decoders are known, in lower case."""
+"""Words that identify lines of decoders, in lower case."""
 _PIPE_SIZE = 1 << 20
 
 
 @contextmanager
 def decoder_noise(alone: bool = True) -> Iterator[list[str]]:
-    """Inside, lines of decoders on the standard error are caught; afterwards the list has them.
+    """Catch lines of decoders on the standard error in a block; afterwards the list has them.
 
     Lines of others go on to the standard error, at the end of a block at the latest. A block that
     is not ``alone`` may also get lines of decoders in other threads.
@@ -28,7 +28,7 @@ def decoder_noise(alone: bool = True) -> Iterator[list[str]]:
 
 
 class _StandardError:
-    """That of the process, redirected into a pipe for as long as anybody decodes."""
+    """Standard error of the process, redirected into a pipe while any thread decodes."""
 
     def __init__(self) -> None:
         self._turn = threading.Condition()
@@ -40,13 +40,13 @@ class _StandardError:
         self._caught: list[str] = []
 
     def enter(self, alone: bool) -> int:
-        """Begin to decode, once whoever is alone is done; how many lines were caught before."""
+        """Begin a block, after any that is alone. Returns the number of lines caught before."""
         with self._turn:
             if alone:
                 self._waiting += 1
                 try:
                     self._turn.wait_for(lambda: not self._inside)
-                finally:  # whoever gives up waiting keeps nobody out
+                finally:  # an interrupted wait blocks no other thread
                     self._waiting -= 1
                 self._is_one_alone = True
             else:
@@ -58,7 +58,7 @@ class _StandardError:
             return len(self._caught)
 
     def leave(self, before: int) -> list[str]:
-        """Be done. Returns the lines that were caught since ``before``."""
+        """End a block. Returns the lines that were caught since ``before``."""
         with self._turn:
             self._read()
             lines = self._caught[before:]
@@ -80,7 +80,7 @@ class _StandardError:
             os.close(here)
             return
         os.set_blocking(there, False)
-        os.set_blocking(here, False)  # what no longer fits is dropped rather than waited for
+        os.set_blocking(here, False)  # lines that do not fit are dropped; nothing waits
         os.dup2(here, 2)
         os.close(here)
         self._pipe = there

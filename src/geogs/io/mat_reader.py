@@ -17,12 +17,12 @@ from geogs.documents import read_bytes
 from geogs.errors import InputError
 
 LARGEST_ARRAY = 1 << 30
-"""Bytes of an array, unpacked; those of DTU have 60 MB."""
+"""Largest size of an unpacked array in bytes; those of DTU have 60 MB."""
 _HEADER, _TAG, _HEAD = 128, 8, 1024
 _MATRIX, _COMPRESSED = 14, 15
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8",
            13: "u8"}  # fmt: skip
-"""Types of what is stored, by their numbers in the file."""
+"""Types of stored values, by their numbers in the file."""
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8",
             15: "u8"}  # fmt: skip
 """Types of arrays, which may be stored as smaller ones."""
@@ -30,7 +30,7 @@ _COMPLEX = 0x0800
 
 
 def read_mat(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Real arrays of these names, without those that are not there.
+    """Read the real arrays of these names; missing ones are left out.
 
     Raises:
         InputError: the file is missing, too large, damaged, or none of MATLAB's version 5 or 7.
@@ -51,7 +51,7 @@ class _Element:
     size: int
     data: memoryview
     end: int
-    """Where the next begins."""
+    """Offset of the next element."""
 
     def whole(self) -> memoryview:
         if len(self.data) < self.size:
@@ -76,7 +76,7 @@ def _arrays(data: bytes, names: Collection[str]) -> Iterator[tuple[str, np.ndarr
                         raise ValueError("too large")
                     matrix = _element(_unpacked(element.whole(), _TAG + matrix.size), order)
                 yield head.name, head.array(matrix.whole(), order)
-        # What is compressed is not filled up to a multiple of eight bytes.
+        # Compressed elements are not padded to a multiple of eight bytes.
         rest = rest[_TAG + element.size if is_packed else element.end :]
 
 

@@ -1,7 +1,7 @@
-"""Pictures from files: decoded without noise on the standard error, and without waiting for pipes.
+"""Pictures from files, decoded without noise on the standard error or waiting for pipes.
 
-The decoders are C libraries, which print what they find wrong. A JPEG that is damaged in its middle
-gives half a picture and such a line, and no error.
+The decoders are C libraries, which print messages. A JPEG that is damaged in its middle gives half
+a picture and such a message, and no error.
 """
 
 import io
@@ -21,13 +21,13 @@ from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
 
 LARGEST_PICTURE = 1 << 31
-"""Bytes of a file."""
+"""Largest file in bytes."""
 _PIXELS_A_BYTE = 10_000
 """Pixels per byte of an all-black picture, compressed as well as any format can."""
 _ORIENTATION, _QUARTER_TURNED = 0x0112, (5, 6, 7, 8)
 """Entry of the EXIF, and its values for which width and height are exchanged."""
 _HARMLESS = 1 << 24
-"""Pixels, or bytes, that are decoded in no time, whatever the file holds."""
+"""Number of pixels, or bytes, that is always quick to decode."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -67,7 +67,7 @@ def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
 
 
 def _decode(data: np.ndarray, flags: int, alone: bool) -> tuple[np.ndarray | None, list[str]]:
-    """The picture, if there is one, and what decoders printed."""
+    """The picture, if there is one, and the decoders' messages."""
     with decoder_noise(alone) as noise:
         try:
             picture = cv2.imdecode(data, flags)
@@ -89,25 +89,25 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
             return picture.size, picture.mode
     except Image.DecompressionBombError:
         raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
-    except Exception:  # whatever a damaged file makes one of its many readers stumble over
+    except Exception:  # a damaged file may raise any exception
         return None
 
 
 def upright_size(path: Path) -> tuple[int, int] | None:
-    """Width and height as :func:`decoded` turns it; none where there is no picture."""
+    """Width and height of the :func:`decoded` picture; none where there is no picture."""
     try:
         with header_read(path) as picture:
             is_turned = picture.getexif().get(_ORIENTATION) in _QUARTER_TURNED
             return picture.size[::-1] if is_turned else picture.size
-    except Exception:  # whatever a damaged file makes one of its many readers stumble over
+    except Exception:  # a damaged file may raise any exception
         return None
 
 
 @contextmanager
 def header_read(path: Path) -> Iterator[Any]:
-    """A picture of which Pillow has read no more than the header, in silence.
+    """Open a picture with Pillow, which reads only the header, without warnings.
 
-    What a damaged file makes one of its many readers stumble over is raised, whatever it is.
+    A damaged file may raise any exception.
     """
     from PIL import Image
 
@@ -132,7 +132,7 @@ def _claims_too_many_pixels(data: np.ndarray) -> bool:
             pixels = picture.width * picture.height
     except Image.DecompressionBombError:
         pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-    except Exception:  # for the decoder to say
+    except Exception:  # left to the decoder
         return False
     return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
 

@@ -3,8 +3,8 @@
 The format is that of Turk (1994): a header lists elements (tables) and their properties (columns),
 then come the rows. A property is a number, or a list of numbers with its length before it.
 
-Read by hand, as a file may come from anybody: trimesh is no faster, would be a dependency, and
-does not say in one sentence what is wrong with a damaged file.
+Read by hand, as files are not trusted: trimesh is no faster, would be a dependency, and has no
+one-sentence errors for damaged files.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ _ORDERS: dict[str, _Order | None] = {
     "ascii": None, "binary_little_endian": "<", "binary_big_endian": ">",
 }  # fmt: skip
 LARGEST_PLY = 1 << 35
-"""Bytes."""
+"""Largest file in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class PlyElement:
     """A table: its properties by their names."""
 
     columns: dict[str, Shaped[np.ndarray, "n"]]
-    """Properties of one number a row, in the type that the header says."""
+    """Properties of one number a row, in the type that the header gives."""
     lists: dict[str, PlyLists]
 
 
@@ -64,14 +64,14 @@ class _Property:
         return f"length of {self.name}"
 
     def fields(self, length: int) -> list[tuple[Any, ...]]:
-        """Its part of a row, with a list of ``length``, as fields of a NumPy record."""
+        """Fields of a NumPy record for this property of a row, with a list of ``length``."""
         if self.stored_length is None:
             return [(self.name, self.stored)]
         return [(self.prefix, self.stored_length), (self.name, self.stored, (length,))]
 
 
 class _WrongPly(ValueError):
-    """An error in words of ours, which repeat little of the file."""
+    """An error with a message of our own, which quotes little of the file."""
 
 
 def read_ply(path: str | Path) -> dict[str, PlyElement]:
@@ -187,7 +187,7 @@ def _rows(
 def _walk(
     data: bytes, start: int, count: int, properties: list[_Property]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Where the numbers of each row and property begin, how many they are, and where rows end."""
+    """Offset and count of the numbers of each row and property, and the end of the rows."""
     starts, lengths = np.ones((2, count, len(properties)), np.int64)
     at = start
     for row in range(count):

@@ -1,7 +1,7 @@
 """Pose files: TUM trajectories, one matrix a row (Replica, KITTI), one file a frame (7-Scenes).
 
 All poses are camera to world in OpenCV axes. Rows that hold no pose (NaN, inf, all zero) are
-dropped, and the log says how many; a file whose numbers mean something else is an error.
+dropped, with a warning; a file whose numbers mean something else is an error.
 """
 
 import logging
@@ -26,7 +26,7 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 POSE_FILES = ("groundtruth.txt", "traj.txt")
 """Names of files with the poses of a sequence in its folder."""
 ORIENTATIONS = "orientations.tum"
-"""The file of a result with the frames of which no more than the orientation is known."""
+"""File of a result with the frames whose orientation is known but not their position."""
 _log = logging.getLogger(__name__)
 _POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
 
@@ -35,7 +35,7 @@ def read_tum_trajectory(path: Path) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` rows (spaces or commas, ``#`` starts a comment).
 
     A file that begins with the quaternion 1 0 0 0 is refused: it is the unit rotation with w first,
-    and hardly ever a half turn about x. Quaternions are made unit; rows are sorted by time.
+    and hardly ever a half turn about x. Quaternions are normalised; rows are sorted by time.
 
     Raises:
         InputError: the file is missing, empty, not of eight columns, or its quaternions are not.
@@ -72,7 +72,7 @@ def _has_pose(
 
 
 def read_frame_poses(folder: Path) -> Trajectory:
-    """Frames of a result whose pose is known, or no more than their orientation, in order of time.
+    """Read the frames of a result with a known pose, or only orientation, in order of time.
 
     Raises:
         InputError: ``trajectory.tum`` is missing, a file is damaged, or no frame is known at all.
@@ -147,10 +147,10 @@ def _read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
 
 
 def read_rows(path: Path, columns: tuple[int, ...], layout: str) -> Float[np.ndarray, "n k"]:
-    """The numbers of a file, which has one of these numbers of columns.
+    """Read the rows of a file whose number of columns is one of these.
 
     Raises:
-        InputError: it has not; ``layout`` says what was expected.
+        InputError: it is not; ``layout`` names what was expected.
     """
     rows: list[list[float]] = []
     for line, numbers in _numbers_by_line(path):
@@ -194,7 +194,7 @@ def _check_quaternions(
 
 
 def is_rigid(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
-    """Which matrices are finite, with a rotation to 1e-2."""
+    """Return which matrices are finite, with a rotation to 1e-2."""
     finite = np.isfinite(T).all(axis=(1, 2))
     rotation = np.where(finite[:, None, None], T[:, :3, :3], 0.0)
     error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -202,7 +202,7 @@ def is_rigid(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
 
 
 def says_pose(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
-    """Which matrices are meant to be a pose: finite, with a 3x3 part that is not all zero."""
+    """Return which matrices are meant as a pose: finite, with a 3x3 part that is not all zero."""
     finite = np.isfinite(T).all(axis=(1, 2))
     return finite & (np.abs(np.where(finite[:, None, None], T, 0))[:, :3, :3].sum((1, 2)) > 0)
 

@@ -1,4 +1,4 @@
-"""A sparse symmetric system of 7 x 7 blocks that is solved again and again with other numbers."""
+"""A sparse symmetric system of 7 x 7 blocks that is solved repeatedly with different values."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ class BlockEquations:
     row: Int[Tensor, "b"]
     column: Int[Tensor, "b"]
     block: Float[Tensor, "b 7 7"]
-    """Added to the matrix at keyframes (row, column)."""
+    """Blocks added to the matrix at keyframes (row, column)."""
     gradient: Float[Tensor, "n 7"]
     """Right-hand side, the direction of descent."""
 
     def without_scale(self) -> "BlockEquations":
-        """The same equations with nothing that moves a scale."""
+        """Return the same equations without the scales."""
         rigid = torch.ones(7, dtype=torch.float64)
         rigid[6] = 0
         block = self.block * rigid[:, None] * rigid
@@ -30,15 +30,15 @@ class BlockEquations:
 
 
 class BlockSystem:
-    """Which blocks there are, in which order they are eliminated, and where their numbers go.
+    """Sparsity structure of the blocks, their elimination order, and the solver.
 
-    The order keeps the factor sparse; it is found once, on the graph of the blocks, which is much
-    smaller than the system (minimum degree).
+    The order keeps the factor sparse; it is computed once, on the graph of the blocks, which is
+    much smaller than the system (minimum degree).
     """
 
     def __init__(self, row: Int[Tensor, "b"], column: Int[Tensor, "b"], count: int) -> None:
-        """Blocks at ``row`` and ``column`` of ``count``, on both sides of the diagonal, some of
-        them more than once; those outside the system, at -1, are left out."""
+        """Blocks at ``row`` and ``column`` of ``count``, on both sides of the diagonal, possibly
+        repeated; those outside the system, at -1, are left out."""
         from scipy.sparse import coo_matrix, csc_matrix
 
         self._given = row.clone(), column.clone()
@@ -46,7 +46,7 @@ class BlockSystem:
         self._inside = torch.nonzero((row >= 0) & (column >= 0))[:, 0]
         place = torch.from_numpy(_elimination_order(row, column, count))
         self._place = place
-        # Every diagonal block is there, also of what nothing ties down.
+        # Every diagonal block exists, also for unconstrained keyframes.
         rows = torch.cat([place[row[self._inside]], torch.arange(count)])
         columns = torch.cat([place[column[self._inside]], torch.arange(count)])
         keys, at = torch.unique(columns * count + rows, return_inverse=True)
@@ -61,7 +61,7 @@ class BlockSystem:
         ).tocsc()
         numbered.sort_indices()
         self._order = numbered.data.astype(np.int64)
-        """Places of the matrix's numbers, column by column, among those of all blocks."""
+        """Indices of the matrix's values, column by column, among those of all blocks."""
         self._matrix: csc_matrix = numbered
 
     def is_of(self, row: Int[Tensor, "b"], column: Int[Tensor, "b"]) -> bool:
@@ -71,9 +71,9 @@ class BlockSystem:
     def solve(
         self, block: Float[Tensor, "b 7 7"], gradient: Float[Tensor, "n 7"], damping: float
     ) -> Float[Tensor, "n 7"] | None:
-        """The solution after the diagonal was raised by a fraction of it; None if it is singular.
+        """Solve after raising the diagonal by a fraction of it; None if the system is singular.
 
-        What nothing ties down stays where it is.
+        Unconstrained keyframes do not move.
         """
         from scipy.sparse.linalg import splu
 
@@ -102,7 +102,7 @@ class BlockSystem:
 def _elimination_order(
     row: Int[Tensor, "b"], column: Int[Tensor, "b"], count: int
 ) -> Int[np.ndarray, "n"]:
-    """The place of each block row when those that join fewest are eliminated first."""
+    """Return the position of each block row in a minimum-degree elimination order."""
     from scipy.sparse import coo_matrix, eye
     from scipy.sparse.linalg import splu
 

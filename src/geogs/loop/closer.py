@@ -1,4 +1,4 @@
-"""Loops along the way: found at keyframes that are final, closed when that changes something."""
+"""Loop closing during tracking: loops are found at final keyframes, and closed if they matter."""
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -43,24 +43,24 @@ from geogs.world.edges import Pair
 from geogs.world.loops import Loop, LoopTable, RelativePoses, SegmentConstraints
 
 MOST_LOOPS = 200
-"""Relative poses of loops from which on older ones are thinned out: bounds the pose graph."""
+"""Number of loop poses above which older ones are thinned out: bounds the pose graph."""
 RETIRED_TOGETHER = 64
-"""Directed edges, of some eight keyframes, that become relative poses in one go."""
+"""Directed edges, of some eight keyframes, converted to relative poses at a time."""
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """A closing that a thread computes."""
+    """A closing computed by a thread."""
 
     question: ClosingQuestion
     answer: Future[LoopClosure | None]
     world: Tracker
     age: int
-    """Age of the world then."""
+    """Age of the main map when it was submitted."""
 
 
 class LoopCloser:
-    """Watches the segments of a run: closes loops within each, and joins segments that meet."""
+    """Closes loops in the main map of a run, and joins segments that meet."""
 
     def __init__(
         self,
@@ -70,8 +70,8 @@ class LoopCloser:
         mask: Bool[np.ndarray, "h w"] | None = None,
         table: LoopTable | None = None,
     ) -> None:
-        """``waits`` and ``mask`` as the detector's. Without waiting, closings are computed by a
-        thread, too, and take effect at a keyframe that becomes final after that."""
+        """``waits`` and ``mask`` as in :class:`LoopDetector`. Without waiting, closings are also
+        computed by a thread, and take effect at a later final keyframe."""
         self.segments = segments
         self.config = config
         tracker = segments.main
@@ -81,27 +81,27 @@ class LoopCloser:
         )
         self._thread = None if waits else ThreadPoolExecutor(1, thread_name_prefix="closing")
         self._asked: _Asked | None = None
-        """What the thread is at, or has answered."""
+        """Closing that the thread computes, or has computed."""
         self._age = 0
-        """How often more than a closing has changed the world."""
+        """Number of changes of the main map other than closings."""
 
     def settle(self) -> None:
-        """Bring the table up to date: searches under way are finished."""
+        """Bring the table up to date: wait for running searches."""
         self.detector.settle()
 
     def remember(self, ids: Sequence[int]) -> None:
-        """Know keyframes of a saved map again from now on; among themselves they make no loops."""
+        """Add keyframes of a saved map to place recognition, without loops among them."""
         if self.config.enabled:
             self.detector.remember(ids)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> Sequence[Recognition]:
-        """Keyframes that show what an image shows."""
+        """Return keyframes recognised in an image."""
         return self.detector.recognise(image) if self.config.enabled else ()
 
     def update(self, result: TrackResult, is_last: bool = False) -> tuple[int, ...]:
-        """After a frame: look for loops at the keyframes that became final, and act on them.
+        """Search loops at the keyframes that became final with a frame, and close them.
 
-        Returns the ids of final keyframes that became part of the world. Corrections are taken
+        Returns the ids of final keyframes that were joined to the main map. Corrections are taken
         from its keyframes (``KeyframeSet.take_corrections``).
         """
         if not self.config.enabled:
@@ -112,7 +112,7 @@ class LoopCloser:
         settled = self._settled(fresh) if fresh or is_last else []
         for loop in self.detector.update(fresh, is_last, settled):
             self._take(loop)
-        # Between keyframes nothing changes that could let segments meet.
+        # Between keyframes nothing changes that could join segments.
         became_final = self._join() if fresh or is_last else ()
         if self._asked is not None and (is_last or (fresh and self._asked.answer.done())):
             self._take_answer()
@@ -121,7 +121,7 @@ class LoopCloser:
         return became_final
 
     def replaced_by_bundle(self) -> None:
-        """All of the world was adjusted together: what its edges say now replaces all else."""
+        """Replace the main map's relative poses by its edges, after a global bundle adjustment."""
         self._age += 1
         world = self.segments.main
         order = {k: n for n, k in enumerate(world.keyframes.ids)}
@@ -137,7 +137,7 @@ class LoopCloser:
         self._retire(world)
 
     def _settled(self, fresh: Sequence[int]) -> list[Pair]:
-        """Pairs near which keyframes that became final are not looked up again."""
+        """Return pairs near which newly final keyframes need no search."""
         tracker = self.segments.tracker_of(fresh[0]) if fresh else self.segments.main
         known, edges = self._of(tracker), tracker.map.graph.edges
         relative = joined([known.odometry, known.loops])
@@ -145,7 +145,7 @@ class LoopCloser:
         return settled_pairs(tracker.keyframes, relative, edges, min_gap, min_change)
 
     def _of(self, tracker: Tracker) -> SegmentConstraints:
-        """What is kept of the relative poses of a segment."""
+        """Return the relative poses of a segment."""
         known, number = self.table.constraints, tracker.segment.number
         if number not in known:
             fixed = sorted(tracker.segment.fixed)
@@ -153,7 +153,7 @@ class LoopCloser:
         return known[number]
 
     def _retire(self, tracker: Tracker, least: int = 1) -> None:
-        """Turn the edges that the local adjustment has left behind into relative poses.
+        """Convert edges that have left the local adjustment to relative poses.
 
         Nothing changes with fewer than ``least`` of them.
         """
@@ -182,7 +182,7 @@ class LoopCloser:
     # --- joining segments ------------------------------------------------------------------
 
     def _join(self) -> tuple[int, ...]:
-        """Join segments between which enough loops agree; ids that thereby reached the world."""
+        """Join segments between which enough loops agree; return ids added to the main map."""
         final: tuple[int, ...] = ()
         for loop in list(self.table.between):
             host, guest = self._ends(loop)
@@ -201,7 +201,7 @@ class LoopCloser:
         return final
 
     def _ends(self, loop: Loop) -> tuple[Tracker, Tracker]:
-        """Host and guest: the world is host, else the earlier segment."""
+        """Return host and guest: the main map is host, else the earlier segment."""
         a, b = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
         world, is_earlier = self.segments.main, b.keyframes.ids < a.keyframes.ids
         if b is world or (a is not world and is_earlier):
@@ -209,7 +209,7 @@ class LoopCloser:
         return a, b
 
     def _claim(self, loop: Loop) -> Float[Tensor, "4 4"]:
-        """Sim(3) from the host's world to the guest's as a loop has it."""
+        """Return the Sim(3) from the host's world to the guest's by a loop."""
         host, guest = self._ends(loop)
         S = loop.S_ji.cpu()
         if host.segment.is_metric and guest.segment.is_metric:
@@ -221,7 +221,7 @@ class LoopCloser:
         return se3_inverse(guest.keyframes[there].T_cw) @ S @ host.keyframes[here].T_cw
 
     def _agrees(self, loop: Loop, S: Float[Tensor, "4 4"]) -> bool:
-        """Whether a loop lands where a Sim(3) of the segments would."""
+        """Whether a loop agrees with a Sim(3) between the segments."""
         _, guest = self._ends(loop)
         state = guest.keyframes[loop.second if loop.second in guest.keyframes else loop.first]
         depth = 1 / state.inverse_depth.median().cpu().double()
@@ -251,10 +251,10 @@ class LoopCloser:
     # --- closing loops ---------------------------------------------------------------------
 
     def _close(self, is_last: bool) -> None:
-        """Correct the world by its loops, if there are new ones and they change something."""
+        """Correct the main map by its loops, if new ones change it."""
         world = self.segments.main
         known, ids = self._of(world), world.keyframes.ids
-        # A correction costs in proportion to the keyframes, so it comes once in a part of them.
+        # The cost of a correction is proportional to the keyframes, and so is its interval.
         pause = max(self.config.close_every, len(ids) // 10)
         due = is_last or len(ids) - known.last_attempt >= pause
         if not known.pending or not due or self._asked is not None:
@@ -270,8 +270,8 @@ class LoopCloser:
             self._asked = _Asked(question, answer, world, self._age)
 
     def _question(self, known: SegmentConstraints) -> ClosingQuestion | None:
-        """What the closing of the world's loops is computed from; none where hardly anything
-        matches: then nothing tells how far the camera has drifted."""
+        """Return the input of a closing of the main map's loops; None where hardly anything
+        matches: then the drift is unknown."""
         world, config = self.segments.main, self.config
         keyframes, edges = world.keyframes, world.map.graph.edges
         ids = keyframes.ids
@@ -294,8 +294,7 @@ class LoopCloser:
         )
 
     def _take_answer(self) -> None:
-        """Correct the world by what the thread has found, or have it found again if that is of
-        another world."""
+        """Apply the closing of the thread, or request another if the main map has changed since."""
         asked, self._asked = self._asked, None
         assert asked is not None
         closure, world = asked.answer.result(), self.segments.main
@@ -305,7 +304,7 @@ class LoopCloser:
             self._of(world).pending += 1
 
     def _correct(self, question: ClosingQuestion, closure: LoopClosure | None) -> None:
-        """Act on a closing, if it changes anything."""
+        """Apply a closing, if it changes anything."""
         if closure is None:
             return
         world = self.segments.main
@@ -327,7 +326,7 @@ class LoopCloser:
         self.table.closures += 1
 
     def _change(self, correction: PoseCorrection) -> float:
-        """How far a correction moves the keyframe that it moves most."""
+        """Return the largest change of a keyframe by a correction."""
         keyframes, ids = self.segments.main.keyframes, sorted(correction.before)
         scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
         S = torch.stack([correction.after[k] for k in ids])
@@ -337,6 +336,6 @@ class LoopCloser:
 
 
 def _rescale(known: SegmentConstraints, correction: PoseCorrection) -> None:
-    """Let relative poses follow a correction."""
+    """Rescale relative poses after a correction."""
     known.odometry = rescaled(known.odometry, correction.scale)
     known.loops = rescaled(known.loops, correction.scale)

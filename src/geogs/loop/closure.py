@@ -1,5 +1,5 @@
-"""Closing loops: vote, adjust relative poses robustly, then let the matches speak; and how the
-answer meets keyframes as they are by then."""
+"""Closing loops: vote, adjust relative poses robustly, then adjust to the matches; and application
+of the result to keyframes that have changed meanwhile."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,47 +19,48 @@ from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import RelativePoses
 
 LEAST_WEIGHT = 0.1
-"""Fraction of its influence that a loop must keep to be believed."""
+"""Least robust weight of an accepted loop."""
 
 
 @dataclass(frozen=True)
 class ClosingQuestion:
-    """What a closing is computed from; nothing in it changes any more."""
+    """Input of a closing; immutable."""
 
     ids: Sequence[int]
-    """Keyframes, ascending."""
+    """Keyframe ids, ascending."""
     T_cw: Float[Tensor, "n 4 4"]
-    """Their poses, world to camera."""
+    """Poses of the keyframes, world to camera."""
     relative: RelativePoses
-    """Between places in ``ids``."""
+    """Relative poses between indices in ``ids``."""
     matches: MatchedEdges | None = None
     fixed: int = 1
-    """Keyframes at the beginning that keep pose and unit."""
+    """Number of first keyframes whose pose and unit are fixed."""
     is_metric: bool = False
-    """Whether all keep their unit."""
+    """Whether all units are fixed."""
     inverse_depths: Mapping[int, Float[Tensor, "p"]] = field(default_factory=dict)
-    """What they were, by id; a depth that was replaced since is not taken over."""
+    """Inverse depths then, by id; an adjusted depth is not applied if it was replaced since."""
 
 
 @dataclass(frozen=True)
 class LoopClosure:
-    """What closing loops brought."""
+    """Result of closing loops."""
 
     correction: PoseCorrection
-    """What tracker and map follow, by keyframe id."""
+    """Correction for tracker and map, by keyframe id."""
     accepted: Bool[Tensor, "e"]
-    """Marks the relative poses given that were kept."""
+    """Whether each of the given relative poses was accepted."""
     inverse_depth: Float[Tensor, "n p"] | None
-    """Adjusted with the matches, in each keyframe's unit *before* the correction; to be taken over
-    first, as ``KeyframeSet.correct`` multiplies by the scale. None without matches."""
+    """Inverse depths adjusted with the matches, in each keyframe's unit *before* the correction;
+    to be applied first, as ``KeyframeSet.correct`` multiplies by the scale. None without
+    matches."""
 
 
 @on_one_torch_thread
 def close_loops(question: ClosingQuestion) -> LoopClosure | None:
-    """Correct keyframes by their loops, in any thread; None if no loop is believed.
+    """Correct keyframes by their loops, in any thread; None if no loop is accepted.
 
-    Loops that contradict the others are left out, those that the kernel lets go of too, and matches
-    between their keyframes with them.
+    Loops that contradict the others or get a low robust weight are left out, and so are the matches
+    between their keyframes.
     """
     T_cw, relative, is_metric = question.T_cw, question.relative, question.is_metric
     keep = consistent_loops(T_cw, relative)
@@ -79,12 +80,12 @@ def close_loops(question: ClosingQuestion) -> LoopClosure | None:
 def brought_forward(
     correction: PoseCorrection, T_cw: Mapping[int, Float[Tensor, "4 4"]]
 ) -> PoseCorrection:
-    """The correction of keyframes as they are now, of one of keyframes as they were.
+    """Transfer a correction of earlier keyframes to the present ones.
 
     ``T_cw`` has the present poses, by id. With T the pose before and S the similarity after, world
     to camera in the keyframe's unit of before, a correction moves what a keyframe shows by
-    S^-1 T. A keyframe that has been adjusted meanwhile moves by the same, S' = T' T^-1 S; one that
-    came later by that of the last one before it. Who is gone is left out.
+    S^-1 T. A keyframe that has been adjusted meanwhile moves by the same, S' = T' T^-1 S; a newer
+    one by that of the last one before it. Removed keyframes are left out.
     """
     known, reference = sorted(correction.before), 0
     after, scale = {}, {}
@@ -106,10 +107,10 @@ def brought_forward(
 def take_over_depths(
     keyframes: KeyframeSet, edges: Collection[Pair], inverse_depth: Mapping[int, Float[Tensor, "p"]]
 ) -> None:
-    """Give keyframes the inverse depth that a closing has found, before its scales are applied.
+    """Set keyframes' inverse depths from a closing, before its scales are applied.
 
-    Only those of the frame graph's edges: what is left of the matches of others is a loop's, which
-    alone says less of a depth than all those that have made it.
+    Only of sources of the frame graph's edges: others only have the matches of loops left, which
+    determine depth less well than all those it was estimated from.
     """
     sources = {i for i, _ in edges}
     for id, own in inverse_depth.items():
@@ -119,7 +120,7 @@ def take_over_depths(
 
 
 def _without(matches: MatchedEdges, rejected: RelativePoses, kept: RelativePoses) -> MatchedEdges:
-    """The matches but those between keyframes whose every relative pose was rejected."""
+    """Return the matches except between keyframes whose relative poses were all rejected."""
     gone = {*rejected.pairs} - {*kept.pairs}
     ends = zip(matches.source.tolist(), matches.target.tolist(), strict=True)
     stays = torch.tensor([(min(e), max(e)) not in gone for e in ends], dtype=torch.bool)

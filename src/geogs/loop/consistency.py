@@ -1,11 +1,11 @@
-"""Which loops agree with each other: a vote that comes before the adjustment.
+"""Selection of loops that agree with each other, before the adjustment.
 
-A loop from keyframe i to j with measurement G claims that the world as drawn around i lies, as
-drawn around j, at ``D = S_j^-1 G S_i``: the drift between the two, a similarity of the world. Two
-true loops claim the same D, but for their noise and for what drifted between their first and
-between their second ends (the cycle through both loops and the odometry between them). False loops
-do not, unless they share a cause, such as two rooms that look alike; then the larger party is right
-more often. Source: pairwise consistency maximisation (Mangelson et al. 2018), greedily.
+A loop from keyframe i to j with measurement G implies the drift ``D = S_j^-1 G S_i`` between the
+two, a similarity from the world as mapped around i to that around j. Two true loops imply the same
+D, except for their noise and the drift between their first and between their second ends (the cycle
+through both loops and the odometry between them). False loops do not, unless they share a cause,
+such as two rooms of similar appearance; then the larger set is right more often.
+Source: pairwise consistency maximisation (Mangelson et al. 2018), greedily.
 """
 
 from dataclasses import dataclass
@@ -21,34 +21,34 @@ from geogs.loop.pose_graph import DRIFT
 from geogs.world.loops import RelativePoses
 
 AGREEMENT = 35.3
-"""Squared error, in squared standard deviations, up to which two loops agree; exceeded once in
-100 000 times by chi^2 with seven degrees of freedom, as many loops have very many pairs."""
+"""Squared error, in squared standard deviations, up to which two loops agree; chi^2 with seven
+degrees of freedom exceeds it once in 100 000 times, as many loops have very many pairs."""
 BIAS = 0.5
-"""Part of a step's deviation that may be the same at every step of the camera, as a drift in scale
-is; it adds up along a chain, where the rest partly cancels."""
+"""Fraction of a step's deviation that may be systematic, such as a drift in scale; it adds up along
+a chain, where the rest partly cancels."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry may have drifted from the first keyframe to each, in the frame of the world."""
+    """Drift of odometry from the first keyframe to each, in the frame of the world."""
 
     covariance: Float[Tensor, "n 7 7"]
-    """Covariance of what is new at every step, summed up."""
+    """Cumulative covariance of the independent errors of all steps."""
     bias: Float[Tensor, "n 7 7"]
-    """One column for each number of the tangent, were it wrong by the same amount at every step."""
+    """Cumulative systematic error, one column for each number of the tangent."""
 
     def between(self, a: Int[Tensor, "l"], b: Int[Tensor, "l"]) -> Float[Tensor, "l 7 7"]:
-        """Covariance of the drift between keyframes, in either order."""
+        """Return the covariance of the drift between keyframes, in either order."""
         first, last = torch.minimum(a, b), torch.maximum(a, b)
         constant = self.bias[last] - self.bias[first]
         return self.covariance[last] - self.covariance[first] + constant @ constant.mT
 
 
 def odometry_drift(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Drift:
-    """Drift along the steps between consecutive keyframes, each by its best known trusted edge.
+    """Compute drift along the steps between consecutive keyframes, each by its best trusted edge.
 
-    A step that no edge covers is known as badly as the worst that is covered. Raises GeogsError if
-    no edge joins consecutive keyframes.
+    A step without an edge gets the variance of the worst step with one. Raises GeogsError if no
+    edge joins consecutive keyframes.
     """
     trusted = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
     edges = relative.select(trusted & (relative.information > 0).all(1))
@@ -58,7 +58,7 @@ def odometry_drift(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Dri
     order = torch.argsort(variance.sum(1), descending=True, stable=True)
     step = torch.minimum(edges.source, edges.target)
     chosen = variance[order[0]].repeat(len(T_cw) - 1, 1)
-    for e in order.tolist():  # the best known comes last and stays
+    for e in order.tolist():  # the best known comes last
         chosen[step[e]] = variance[e]
     carry = sim3_adjoint(se3_inverse(T_cw[1:]))
     steps = DRIFT * (carry * chosen[:, None]) @ carry.mT
@@ -70,7 +70,7 @@ def odometry_drift(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Dri
 def cycle_errors(
     T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses
 ) -> tuple[Float[Tensor, "l l"], Float[Tensor, "l"]]:
-    """Squared errors, in squared standard deviations, of the loops of a graph among themselves.
+    """Compute squared errors, in squared standard deviations, of the loops of a graph.
 
     Of each cycle of two loops with the odometry between them, and of each loop with the odometry
     between its ends.
@@ -83,7 +83,7 @@ def cycle_errors(
     own = (carry / loops.information.clamp(min=1e-12)[:, None]) @ carry.mT
     first = torch.minimum(loops.source, loops.target)
     second = torch.maximum(loops.source, loops.target)
-    # All claims run from the earlier keyframe to the later.
+    # All drifts are from the earlier keyframe to the later.
     turned = (loops.source > loops.target)[:, None, None]
     D = torch.where(turned, sim3_inverse(D), D)
     alone = _squares(sim3_log(D), own + drift.between(first, second))
@@ -97,11 +97,11 @@ def cycle_errors(
 
 
 def consistent_loops(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Bool[Tensor, "e"]:
-    """Marks the trusted edges and the largest party of loops of which every two agree.
+    """Mark the trusted edges and the largest set of mutually consistent loops.
 
-    Loops that contradict the odometry stand outside. A party is grown from each loop, taking those
-    first that agree with most; the one with most pairs of keyframes wins, then the one whose errors
-    are least. Loops in both directions between two keyframes count once.
+    Loops that contradict the odometry are excluded. A set is grown from each loop, adding those
+    first that agree with most. The set with most pairs of keyframes wins, then the one with the
+    smallest errors. Loops in both directions between two keyframes count once.
     """
     keep = ~relative.is_loop
     if not bool(relative.is_loop.any()):
@@ -121,14 +121,14 @@ def consistent_loops(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> B
         if score > best:
             best, winner = score, party
         if len(party) == int(plausible.sum()):
-            break  # all agree, so that all others grow to the same party
+            break  # all agree, so all others grow to the same set
     if winner:
         keep[torch.nonzero(relative.is_loop)[:, 0][winner]] = True
     return keep
 
 
 def _grow(agree: Bool[np.ndarray, "l l"], seed: int) -> list[int]:
-    """A set around a loop of which every two agree."""
+    """Grow a mutually consistent set from a loop."""
     party, open_to = [seed], agree[seed].copy()
     open_to[seed] = False
     friends = agree @ open_to.astype(np.int32)
@@ -143,5 +143,5 @@ def _grow(agree: Bool[np.ndarray, "l l"], seed: int) -> list[int]:
 
 
 def _squares(error: Float[Tensor, "l 7"], covariance: Float[Tensor, "l 7 7"]) -> Float[Tensor, "l"]:
-    """Squared Mahalanobis lengths."""
+    """Return squared Mahalanobis lengths."""
     return (error * torch.linalg.solve(covariance, error)).sum(-1)

@@ -1,5 +1,5 @@
-"""What is known of the keyframes of one tracker relative to each other: relative poses by id, and
-the matches that close loops."""
+"""Constraints between the keyframes of one tracker: relative poses by id, and matches for closing
+loops."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,36 +19,36 @@ from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs.world.loops import Loop, RelativePoses
 
 AGREEING_LOOPS = 2
-"""Loops that have to agree before a segment is joined to another: one may be a look-alike."""
+"""Number of loops that have to agree before a segment is joined to another: one may be false."""
 JOIN_TOLERANCE = 0.12
 """Largest difference between loops that agree: radians, fraction of the median depth, or of the
-scale. Segments drift by as much within themselves."""
+scale. Segments drift by as much internally."""
 
 
 def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
-    """All of them, in this order."""
+    """Concatenate relative poses."""
     columns = ("source", "target", "G", "information", "is_loop")
     return RelativePoses(*(torch.cat([getattr(p, c) for p in parts]) for c in columns))
 
 
 def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge]) -> RelativePoses:
-    """Relative poses, between ids, that fitted edges of a frame graph amount to.
+    """Compute relative poses, between ids, from fitted edges of a frame graph.
 
-    Of the two directions of a pair the one from the earlier keyframe is taken.
+    Of the two directions of a pair the one from the earlier keyframe is used.
     """
     pairs = sorted(e for e in edges if e[0] < e[1])
     if not pairs:
         return RelativePoses.none()
     ids, grid = sorted({k for p in pairs for k in p}), segment.grid
     matched = _matched(segment, grid, ids, pairs, *edge_matches(grid, [edges[p] for p in pairs]))
-    # A bundle adjustment has fitted them, with more than they tell alone.
+    # A bundle adjustment has fitted them, with more data than these matches alone.
     return _named(relative_poses(grid, matched, segment.poses(ids), False, steps=0), ids)
 
 
 def closing_matches(
     segment: KeyframeSet, edges: Mapping[Pair, Edge], loops: Sequence[Loop]
 ) -> MatchedEdges | None:
-    """Matches between places in the segment's order, on the CPU; none where there are none.
+    """Return matches between indices in the segment's order, on the CPU; None without any.
 
     Both directions of the frame graph's edges and of the loops within the segment; where a pair is
     in both, the frame graph's.
@@ -77,7 +77,7 @@ def _matched(
     pixels: Float[Tensor, "e p 2"],
     weight: Float[Tensor, "e p 2"],
 ) -> MatchedEdges:
-    """Matches of pairs of ids as those of places in ``ids``, where the grid is; none of dynamic
+    """Convert matches of pairs of ids to indices in ``ids``, on the grid's device, without dynamic
     cells."""
     slot, there = {k: n for n, k in enumerate(ids)}, grid.rays.device
     weight = static_weight(segment, directed, pixels, weight)
@@ -93,7 +93,7 @@ def _matched(
 
 
 def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
-    """Relative poses between neighbours in a list of ids, as certain as any can be."""
+    """Return relative poses between neighbours in a list of ids, with the largest information."""
     if len(ids) < 2:
         return RelativePoses.none()
     T_cw = segment.poses(ids)
@@ -108,7 +108,7 @@ def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
 
 
 def of_loop(keyframes: KeyframeTable, loop: Loop) -> RelativePoses:
-    """Relative poses, between ids, of a loop: one for each direction of its flow."""
+    """Compute relative poses, between ids, of a loop: one for each direction of its flow."""
     one, other = keyframes[loop.first], keyframes[loop.second]
     there, back = loop.flows
     grid = _on_cpu(keyframes.grid)
@@ -129,12 +129,12 @@ def of_loop(keyframes: KeyframeTable, loop: Loop) -> RelativePoses:
 
 
 def _on_cpu(grid: SampleGrid) -> SampleGrid:
-    """The grid where relative poses are solved."""
+    """Return the grid on the CPU, where relative poses are solved."""
     return SampleGrid(grid.camera) if grid.on_gpu else grid
 
 
 def between_positions(relative: RelativePoses, ids: Sequence[int]) -> RelativePoses:
-    """Relative poses between ids as those between places in the sorted list ``ids``."""
+    """Convert relative poses between ids to indices in the sorted list ``ids``."""
     sorted_ids = torch.tensor(ids)
     return replace(
         relative,
@@ -144,7 +144,7 @@ def between_positions(relative: RelativePoses, ids: Sequence[int]) -> RelativePo
 
 
 def rescaled(relative: RelativePoses, scale: Mapping[int, float]) -> RelativePoses:
-    """Relative poses between ids after the unit of each keyframe was divided by its scale."""
+    """Return relative poses between ids after the unit of each keyframe was divided by its scale."""
     if not scale or not len(relative):
         return relative
     ids = sorted(scale)
@@ -153,13 +153,13 @@ def rescaled(relative: RelativePoses, scale: Mapping[int, float]) -> RelativePos
 
 
 def _named(relative: RelativePoses, ids: Sequence[int]) -> RelativePoses:
-    """Relative poses between places in a list of ids as those between the ids."""
+    """Convert relative poses between indices in a list of ids to the ids."""
     names = torch.tensor(ids)
     return replace(relative, source=names[relative.source], target=names[relative.target])
 
 
 def thinned(relative: RelativePoses, most: int) -> RelativePoses:
-    """At most so many relative poses: of the older half, every second goes when there are more."""
+    """Remove every second relative pose of the older half if there are more than ``most``."""
     n = len(relative)
     if n <= most:
         return relative
@@ -168,7 +168,7 @@ def thinned(relative: RelativePoses, most: int) -> RelativePoses:
 
 
 def squared_errors(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e"]:
-    """Squared errors of relative poses between places at given poses, in their own variances."""
+    """Return squared errors of relative poses between indices at given poses, in own variances."""
     now = relative_motion(T_cw, relative.source, relative.target)
     error = sim3_log(relative.G @ sim3_inverse(now))
     return (relative.information * error.square()).sum(-1)
@@ -177,8 +177,8 @@ def squared_errors(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Flo
 def differences(
     T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, depth: Float[Tensor, "n"]
 ) -> Float[Tensor, "e"]:
-    """How far relative poses between places lie from given poses, as :func:`disagreement` has it
-    in the frames of their targets, whose median depth is ``depth``."""
+    """Return the :func:`disagreement` of relative poses between indices with given poses, in the
+    frames of their targets, whose median depth is ``depth``."""
     now = relative_motion(T_cw, relative.source, relative.target)
     return disagreement(relative.G, now, depth[relative.target])
 
@@ -186,7 +186,7 @@ def differences(
 def disagreement(
     S: Float[Tensor, "*b 4 4"], other: Float[Tensor, "*b 4 4"], depth: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b"]:
-    """Largest of the rotation in radians, the shift over a depth, and the change of scale."""
+    """Return the largest of rotation in radians, shift over depth, and change of scale."""
     error = sim3_log(S @ sim3_inverse(other)).abs()
     shift, rotation = error[..., :3].norm(dim=-1) / depth, error[..., 3:6].norm(dim=-1)
     return torch.stack([shift, rotation, error[..., 6]]).amax(0)

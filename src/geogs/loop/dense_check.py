@@ -1,4 +1,4 @@
-"""The last word on a loop: dense flow, started from the pose that the features gave."""
+"""Final verification of a loop by dense flow, started from the pose of the features."""
 
 import math
 from dataclasses import dataclass
@@ -19,24 +19,25 @@ from geogs.world.keyframes import Keyframe
 MIN_MATCHED = 0.15
 """Least fraction of the cells whose flow agrees with the pose, in each direction."""
 MAX_RESIDUAL = 0.0033
-"""Largest median reprojection error of the flow, of the long edge: under two pixels of 512."""
+"""Largest median reprojection error of the flow, as a fraction of the long edge: under two pixels
+of 512."""
 MAX_CONTRADICTION = 0.1
-"""Largest fraction of the surface of one view, where the other looks at it, through which the other
-sees. Tells look-alikes apart where their shapes differ within the view."""
+"""Largest fraction of one view's surface, within the other's view, that the other sees through. It
+rejects similar images of scenes that differ in shape."""
 MAX_ROTATION_DISAGREEMENT_DEG = 3.0
-"""Largest rotation between the poses found in the two directions."""
+"""Largest rotation between the poses estimated in the two directions."""
 MIN_NCC = 0.5
-"""Least median correlation of the images at those poses, in each direction: unlike images come to
-0, one place to 0.7 and more."""
+"""Least median correlation of the images at those poses, in each direction: different scenes give
+0, the same place 0.7 and more."""
 
 
 @dataclass(frozen=True)
 class DenseCheck:
-    """What the flow between two keyframes says of a supposed loop."""
+    """Verification of a loop candidate by the flow between its keyframes."""
 
     accepted: bool
     reason: str
-    """Why not; empty if accepted."""
+    """Reason for rejection; empty if accepted."""
     T_ji: Float[Tensor, "4 4"] | None = None
     """First camera to second in the first's lengths, float64, by the flow."""
     scale: float = 1.0
@@ -46,9 +47,9 @@ class DenseCheck:
     residual: float = math.inf
     """Median error of the reprojection in pixels, in the poorer direction."""
     contradiction: float = 1.0
-    """Fraction of one view's surface through which the other sees, in the poorer direction."""
+    """Fraction of one view's surface that the other sees through, in the poorer direction."""
     there: FlowMatch | None = None
-    """The flow from the first to the second, one edge."""
+    """Flow from the first to the second, one edge."""
     back: FlowMatch | None = None
 
 
@@ -60,12 +61,11 @@ def dense_check(
     T_ji: Float[Tensor, "4 4"],
     scale: float = 1.0,
 ) -> DenseCheck:
-    """Measure the flow between two keyframes from their supposed relative pose, and judge it.
+    """Measure the flow between two keyframes from a candidate relative pose, and verify it.
 
-    Both directions are measured together and located on their own, each on the depth of its
-    source; their poses must turn alike, both views' depth must agree up to one scale where they
-    match, where they do not match neither may see through what the other shows, and the images must
-    agree at the poses.
+    Both directions are measured together and located separately, each on the depth of its source.
+    Their rotations must agree; both views' depths must agree up to one scale at matches; neither
+    may see through the other's surface elsewhere; and the images must pass the photometric check.
     ``T_ji`` is in the first's lengths, ``scale`` as in :class:`DenseCheck`.
     """
     limit = MAX_RESIDUAL * grid.camera.long_edge
@@ -115,7 +115,7 @@ def _depth_ratios(
     there: FrameMotion,
     T_ji: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "m"]:
-    """Logarithm of the second's depth over the first's as seen from it, at confident matches."""
+    """Return the log ratio of the second's depth to the first's seen from it, at sure matches."""
     T = T_ji.to(grid.rays)
     pixels = there.match.pixels[0]
     forward = (grid.rays @ T[:3, :3].mT + first.inverse_depth[:, None] * T[:3, 3])[:, 2]
@@ -127,7 +127,7 @@ def _depth_ratios(
 
 
 def _consensus(ratios: Float[Tensor, "m"]) -> tuple[float, float]:
-    """Median ratio, and the fraction of the ratios that keep to it."""
+    """Return the median ratio, and the fraction of the ratios that agree with it."""
     if not len(ratios):
         return 1.0, 0.0
     middle = ratios.median()
@@ -137,9 +137,9 @@ def _consensus(ratios: Float[Tensor, "m"]) -> tuple[float, float]:
 def _seen_through(
     grid: SampleGrid, source: Keyframe, target: Keyframe, T_ts: Float[Tensor, "4 4"], scale: float
 ) -> float:
-    """Fraction of the source's surface in the target's view behind which the target has its own.
+    """Return the fraction of the source's surface that lies before the target's in its view.
 
-    Surface that the target has before it is occluded and does not count; 1 where nothing is left.
+    Surface behind the target's is occluded and does not count; 1 where nothing is left.
     """
     T = T_ts.to(grid.rays)
     shown = project(grid.camera, grid.rays, T_ts[None], source.inverse_depth[None])
@@ -148,7 +148,7 @@ def _seen_through(
     cell, inside = grid.cells_of(pixels)
     known = inside & shown.valid[0] & (forward > 1e-6) & (source.inverse_depth > 1e-9)
     known = known & (source.information > 0) & (target.information[cell] > 0)
-    # The nearest of the cells around, so that no edge of a surface passes for a gap in it.
+    # The nearest of the cells around, so that no edge of a surface counts as a gap in it.
     image = target.inverse_depth.reshape(1, 1, grid.height, grid.width)
     nearest = torch.nn.functional.max_pool2d(image, 3, 1, 1).reshape(-1)[cell]
     expected = (source.inverse_depth / (scale * forward.clamp(min=1e-6))).clamp(min=1e-9)

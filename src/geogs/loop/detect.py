@@ -1,4 +1,4 @@
-"""Loops: pairs of keyframes far apart in time that show one place."""
+"""Loop detection: pairs of keyframes far apart in time that show the same place."""
 
 from bisect import bisect_left, bisect_right
 from collections import deque
@@ -23,33 +23,32 @@ from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import Loop, LoopTable, VerifiedCandidate
 
 MAX_FLOW_DISTANCE = 0.29
-"""Flow distance below which the present poses make a pair a candidate, of the long edge (22 cells
-of 8 pixels at 616 pixels, as HI-SLAM2 has it)."""
+"""Flow distance below which the present poses make a pair a candidate, as a fraction of the long
+edge (22 cells of 8 pixels at 616 pixels, as in HI-SLAM2)."""
 ROTATION_WEIGHT = 0.3
-"""Weight of the flow with the rotation in that distance, the rest is without: a place may be seen
-again from another direction."""
+"""Weight of the flow with rotation in that distance; the rest is without rotation, as a place may
+be revisited from another direction."""
 MAX_ANGLE_DEG = 120.0
 """Largest angle between the orientations of such a pair."""
 MAX_BASELINE = 1.5
-"""Largest distance between their centres, of the keyframe's median depth."""
+"""Largest distance between their centres, over the keyframe's median depth."""
 MEASURED = 48
 """Most such pairs, nearest first, whose flow distance is computed: bounds the cost."""
 MIN_MATCHED_ALONE = 0.3
 """Least fraction of the cells whose flow agrees where only the present poses, and no features,
-speak for the loop."""
+support the loop."""
 MAX_LOOPS = 2
-"""Most loops per keyframe: more of one place say the same."""
+"""Most loops per keyframe: more of one place are redundant."""
 LAG = 2
-"""Keyframes for which a search may run beside tracking before it is waited for."""
+"""Number of keyframes for which a search may run in parallel to tracking before it is awaited."""
 
 
 class LoopDetector:
     """Finds loops at final keyframes: appearance and features propose, dense flow decides.
 
-    Place recognition runs in a thread concurrently with tracking; what it finds is taken up
-    ``LAG`` keyframes later, at the same frame however fast the machine is. Keyframes
-    may lie in several segments, whose poses have nothing to do with each other: between them, only
-    appearance proposes.
+    Place recognition runs in a thread concurrently with tracking; its results are used ``LAG``
+    keyframes later, at the same frame however fast the machine is. Keyframes may lie in several
+    segments with unrelated gauges: between these, only appearance proposes.
     """
 
     def __init__(
@@ -61,16 +60,16 @@ class LoopDetector:
         mask: Bool[np.ndarray, "h w"] | None = None,
         table: LoopTable | None = None,
     ) -> None:
-        """Unless it ``waits`` for searches that take longer, what they find is taken up later.
+        """Unless it ``waits`` for slow searches, their results are used later.
 
-        Outside a ``mask`` of the size of the images no features are found.
+        Outside a ``mask`` of the size of the images no features are detected.
         """
         self.keyframes = keyframes
         self.grid = keyframes.grid
         self.operator = operator
         self.config = config
         self._waits = waits
-        # What the search reads was written in the stream of whoever made the detector.
+        # The search reads data written in the stream in which the detector was made.
         stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
         self._thread = ThreadPoolExecutor(
             max_workers=1, thread_name_prefix="loops",
@@ -81,20 +80,20 @@ class LoopDetector:
         """Rank in time of each keyframe searched so far."""
         self._search = PlaceRecognition(self.grid, self.config, self._order, mask, self.table)
         self._pending: deque[Future[None] | None] = deque(None for _ in self.table.found)
-        """The search for each keyframe that is not decided yet; none where it was done before."""
+        """Search for each keyframe without a decision yet; None where it was done before."""
 
     def settle(self) -> None:
-        """Finish the searches that are under way, so that the table holds what they found."""
+        """Finish the running searches, so that the table has their results."""
         for search in self._pending:
             _finish(search)
 
     def update(
         self, ids: Sequence[int], is_last: bool = False, settled: Sequence[Pair] = ()
     ) -> tuple[Loop, ...]:
-        """Take keyframes that became final, earliest first, and return loops that were found.
+        """Add keyframes that became final, earliest first, and return the loops found.
 
-        They are those of the keyframes ``lag`` earlier, and at the end of all. None is looked for
-        near pairs of keyframes that are ``settled``.
+        They are those of the keyframes ``LAG`` earlier, and at the end those of all. No loop is
+        searched near ``settled`` pairs of keyframes.
         """
         found: list[Loop] = []
         for id in ids:
@@ -110,17 +109,17 @@ class LoopDetector:
         return tuple(found)
 
     def remember(self, ids: Sequence[int]) -> None:
-        """Take keyframes that are to be recognised, and are loops of none before them."""
+        """Add keyframes for recognition only, without searching their loops."""
         for id in ids:
             self._enter(id)
             self._thread.submit(self._search.remember, id, self.keyframes[id].image)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> list[Recognition]:
-        """Keyframes that show what an image shows, with its pose; most alike first."""
+        """Return keyframes recognised in an image, with its pose; most similar first."""
         return self._thread.submit(self._search.recognise, image, self._depths()).result()
 
     def candidates(self, id: int) -> list[int]:
-        """Keyframes that the present poses say a taken one sees again, nearest first."""
+        """Return keyframes that an added one revisits by the present poses, nearest first."""
         facing, segment = self._facing(id), self.keyframes.set_of[id]
         if not facing:
             return []
@@ -137,17 +136,17 @@ class LoopDetector:
         return Query(id, features, near, by_pose, known, tuple(settled), self._depths())
 
     def _ranked(self, pairs: Sequence[Pair]) -> list[Pair]:
-        """The pairs of keyframes taken so far."""
+        """Return the pairs whose keyframes have both been added."""
         return [p for p in pairs if p[0] in self._order and p[1] in self._order]
 
     def _enter(self, id: int) -> None:
-        """Take a keyframe as the latest."""
+        """Add a keyframe as the latest."""
         self.table.keyframes.append(id)
         self._order[id] = len(self._order)
 
     def _found_near(self, id: int) -> list[Pair]:
-        """Pairs of the loops found whose later keyframe is so near to one that they can rule out
-        others of it; loops are found in the order of their later keyframes."""
+        """Return the pairs of loops whose later keyframe is near enough to this one to suppress its
+        candidates; loops are ordered by their later keyframes."""
         rank, loops = self._order[id], self.table.loops
         first = bisect_left(loops, rank - SUPPRESSION, key=self._later_rank)
         last = bisect_right(loops, rank + SUPPRESSION, key=self._later_rank)
@@ -157,28 +156,28 @@ class LoopDetector:
         return self._order[loop.second]
 
     def _is_implied(self, id: int, found: Sequence[Loop], settled: Sequence[Pair]) -> bool:
-        """Whether a place was joined before with one that a loop of the same keyframe has found."""
+        """Whether a keyframe is already linked with one in a loop found for the same keyframe."""
         pairs = ((min(id, loop.first), max(id, loop.first)) for loop in found)
         return any(
             self._search.is_suppressed(pair, self._found_near(pair[1]), settled) for pair in pairs
         )
 
     def _near(self, id: int) -> frozenset[int]:
-        """The keyframe itself and those of the same time and segment."""
+        """Return the keyframe itself and those near it in time in the same segment."""
         segment, recent = self.keyframes.set_of[id], self.table.keyframes[self._first_near(id) :]
         return frozenset(k for k in recent if k in segment)
 
     def _first_near(self, id: int) -> int:
-        """Rank of the first keyframe at most ``min_gap`` keyframes before one."""
+        """Return the rank of the first keyframe at most ``min_gap`` keyframes before one."""
         return max(self._order[id] - self.config.min_gap, 0)
 
     def _depths(self) -> Depths:
-        """What is known of the depth of all keyframes now; they are replaced, never changed."""
+        """Return the present depths of all keyframes; they are replaced, never changed."""
         states = {k: self.keyframes[k] for k in self._order}
         return {k: (s.inverse_depth, s.information) for k, s in states.items()}
 
     def _facing(self, id: int) -> list[int]:
-        """The earlier keyframes nearest by that look roughly the same way; there are never many."""
+        """Return the nearest earlier keyframes with a similar viewing direction; a limited number."""
         segment = self.keyframes.set_of[id]
         old = np.array(self.table.keyframes[: self._first_near(id)], np.int64)
         depth = 1 / float(segment[id].inverse_depth.median())
@@ -186,7 +185,7 @@ class LoopDetector:
         return list(islice((k for k in around.tolist() if k in segment), MEASURED))
 
     def _decide(self, settled: Sequence[Pair]) -> list[Loop]:
-        """The loops among the candidates of the keyframe whose turn it is."""
+        """Return the loops among the candidates of the next keyframe."""
         _finish(self._pending.popleft())
         found: list[Loop] = []
         for view in self.table.found.pop(0):
@@ -200,7 +199,7 @@ class LoopDetector:
             if loop is None:
                 continue
             found.append(loop)
-            # Of a long video the flows of all loops would fill the memory.
+            # In a long video the flows of all loops would fill the memory.
             kept = loop if self.config.matches else replace(loop, there=None, back=None)
             self.table.loops.append(kept)
             if len(found) == MAX_LOOPS:
@@ -208,10 +207,10 @@ class LoopDetector:
         return found
 
     def _verify(self, verified: VerifiedCandidate) -> Loop | None:
-        """The loop that a candidate is, if it is one.
+        """Return the loop of a candidate if the flow confirms it, else None.
 
-        Features found the pose, the flow confirms it; where they failed, present poses may do.
-        Plain surfaces have few corners, but when the drift is small the flow needs none.
+        The initial pose is that of the features, or the present one where they failed: plain
+        surfaces have few corners, but when the drift is small the flow needs none.
         """
         p, view = verified.candidate, verified.view
         first, second, grid = self.keyframes[p.first], self.keyframes[p.second], self.grid
@@ -233,6 +232,6 @@ class LoopDetector:
 
 
 def _finish(search: Future[None] | None) -> None:
-    """Wait for a search that may be under way; raises what it has raised."""
+    """Wait for a search that may be running; re-raises its exception."""
     if search is not None:
         search.result()

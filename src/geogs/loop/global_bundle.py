@@ -1,4 +1,4 @@
-"""Bundle adjustment over all keyframes, with flow measured anew from round to round."""
+"""Bundle adjustment over all keyframes, with flow measured again in every round."""
 
 from geogs.loop.camera.adjustment import adjust_camera
 from geogs.loop.keyframe_matches import STAGE, KeyframeMatches
@@ -13,15 +13,14 @@ PRIORS_TOGETHER = 32
 def global_bundle(
     tracker: Tracker, progress: StageProgress = unwatched, ends: bool = False
 ) -> PoseCorrection:
-    """Refine all keyframes of a tracker on a fresh graph that also joins places seen again.
+    """Refine all keyframes of a tracker on a fresh graph that also links revisited places.
 
-    The pose of the first of them stays, or, in the world of a saved map, all that is of those it
-    holds. Poses, inverse depth and information of the tracker are updated, and its graph holds the
-    fresh edges alone: one that goes on tracking needs only those that ``FrameGraph.retire`` leaves
-    of them. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking,
-    images are straightened by what matches say of the camera
-    (:func:`~geogs.loop.camera.adjustment.adjust_camera`). A tracker without a map is left alone,
-    and one whose images are straight already.
+    The first pose is fixed or, in the world of a saved map, all its keyframes. Poses, inverse depth
+    and information of the tracker are updated, and its graph only has the fresh edges; further
+    tracking only needs those that ``FrameGraph.retire`` keeps. Returns the poses before and after;
+    scales are 1. Where it ``ends`` the tracking, images are straightened by the camera estimated
+    from the matches (:func:`~geogs.loop.camera.adjustment.adjust_camera`). A tracker without a map,
+    or with straightened images, is not changed.
     """
     store, ids = tracker.keyframes, tracker.segment.ids
     if not ids or store.table.lens is not None:

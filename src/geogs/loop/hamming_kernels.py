@@ -1,7 +1,7 @@
-"""Compiled search of binary descriptors: nearest ones by the number of bits that differ.
+"""Compiled nearest-neighbour search of binary descriptors by Hamming distance.
 
-Ten times as fast as OpenCV's matcher, and finds the same of equally near ones. The kernel releases
-the interpreter lock.
+Ten times as fast as OpenCV's matcher, with the same result for ties. The kernel releases the
+interpreter lock.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _1, _2, _4, _56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
 
 @njit(**inlined(_EXACT))
 def _ones(word):
-    """How many bits are set; compilers know these lines for the processor's own instruction."""
+    """Count the bits set; compilers replace this by the processor's own instruction."""
     word = word - ((word >> _1) & _PAIRS)
     word = (word & _FOURS) + ((word >> _2) & _FOURS)
     word = (word + (word >> _4)) & _EIGHTS
@@ -28,11 +28,10 @@ def _ones(word):
 
 @njit(**_EXACT)
 def two_nearest(source, target):
-    """The nearest target of each source, its distance and that of the second nearest, in bits.
+    """Find the nearest target of each source, its distance and that of the second nearest, in bits.
 
     ``source`` (n, 4) and ``target`` (m, 4) are descriptors of 256 bits as uint64; the results (n)
-    int64. Of equally near targets the first is nearest; the distance to one that there is not is
-    257.
+    int64. Ties go to the first target; the distance to a missing target is 257.
     """
     index = np.zeros(len(source), np.int64)
     nearest = np.full(len(source), 257, np.int64)

@@ -1,4 +1,4 @@
-"""Matches between all keyframes of a tracker: measured, corrected for the camera, adjusted to."""
+"""Matches between all keyframes of a tracker: measurement, correction and adjustment."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,57 +18,57 @@ from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
 STAGE = "bundle adjustment"
-"""What progress is reported of."""
+"""Name of the stage in progress reports."""
 ROUNDS = 4
-"""Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
+"""Most rounds of flow and adjustment: each improves the next, later ones by little."""
 REMEASURE = 0.25
-"""A pair is matched again when its reprojection has moved by this many pixels."""
+"""Change of its reprojection, in pixels, after which a pair is matched again."""
 MAX_DISTANCE = 0.5
-"""Largest frame distance of a pair, of the long edge."""
+"""Largest frame distance of a pair, as a fraction of the long edge."""
 SUPPRESSION = 3
-"""Pairs within this many keyframes of a chosen one are left out, as they say the same."""
+"""Distance in keyframes from a chosen pair within which others are left out as redundant."""
 PAIRS = 10
 """Most pairs per keyframe: time against precision."""
 MATCHED_TOGETHER = 16, 48
-"""Pairs that are matched in one go, on the CPU and on a GPU."""
+"""Pairs matched at a time, on the CPU and on a GPU."""
 CONVERGED = 0.02
-"""The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
+"""Fraction of pairs whose reprojection still moves, below which the rounds end."""
 GLOBAL_OPTIONS = BundleOptions(
     iterations=10, huber=HUBER, damping=1e-6, least_damping=1e-8, depth_damping=1e-5, tolerance=1e-5
 )
-"""How each round is solved; it ends with a step that moves no pose by more, in units and radians.
-A drift of scale along many keyframes has a curvature far below 1e-4 of the diagonal, the less the
-more they are, and carries all depths along: with the usual damping of either the steps end long
-before it is gone (docs/adjustment.md)."""
+"""Solver options of a round; it ends with a step that changes poses by less than the tolerance, in
+units and radians. A drift of scale along many keyframes has a curvature far below 1e-4 of the
+diagonal, the smaller the more they are, and changes all depths: with the usual damping of either
+the steps end long before it is corrected (docs/adjustment.md)."""
 
 Measured = Mapping[Pair, PackedEdge]
 Shifts = Callable[[list[Pair]], Float[Tensor, "e p 2"]]
-"""Pixels to be added to the matches of some edges, by the present poses and depths."""
+"""Function returning the correction, in pixels, of the matches of some edges at the present state."""
 
 
 @dataclass(frozen=True)
 class KeyframeMatches:
-    """Matches between the keyframes of a tracker, and what an adjustment to them moves."""
+    """Matches between the keyframes of a tracker, and the free unknowns of their adjustment."""
 
     tracker: Tracker
     free_pose: Sequence[int]
     free_depth: Sequence[int]
     pairs: Sequence[Pair] = ()
-    """That are matched."""
+    """Matched pairs."""
     progress: StageProgress = unwatched
     options: BundleOptions = GLOBAL_OPTIONS
     measured: dict[Pair, PackedEdge] = field(default_factory=dict)
-    """The edges as they were measured; the graph has them corrected."""
+    """Edges as measured; the graph has the corrected ones."""
     corrections: dict[str, Shifts] = field(default_factory=dict)
-    """What is added to all matches whenever they are adjusted to, by what it corrects."""
+    """Corrections added to all matches before each adjustment, by name."""
 
     def __post_init__(self) -> None:
         self.measured.update(self.graph.packed)
 
     @staticmethod
     def of(tracker: Tracker, progress: StageProgress = unwatched) -> "KeyframeMatches":
-        """Those of all keyframes. The first pose stays, or, in the world of a saved map, all that
-        is of the keyframes it holds."""
+        """Return those of all keyframes. The first pose is fixed or, in the world of a saved map,
+        all its keyframes."""
         segment = tracker.segment
         free_pose = segment.free if segment.fixed else segment.ids[1:]
         return KeyframeMatches(
@@ -77,17 +77,17 @@ class KeyframeMatches:
 
     @property
     def camera(self) -> Camera:
-        """By which they are seen."""
+        """Camera of the matches."""
         return self.keyframes.grid.camera
 
     @property
     def keyframes(self) -> KeyframeSet:
-        """Which are matched."""
+        """Keyframes of the tracker."""
         return self.tracker.keyframes
 
     @property
     def graph(self) -> FrameGraph:
-        """Which has the edges."""
+        """Frame graph of the edges."""
         return self.tracker.map.graph
 
     @property
@@ -96,10 +96,10 @@ class KeyframeMatches:
         return self.tracker.map.recorder.log
 
     def measure(self, fine: bool, anew: bool = True) -> None:
-        """Measure all pairs and adjust everything, from round to round those that have moved.
+        """Measure all pairs and adjust everything; in further rounds measure those that have moved.
 
-        At full resolution where it is ``fine``, else at half of it; small images always at full.
-        If not ``anew``, pairs that have not moved since they were measured stay.
+        At full resolution if ``fine``, else at half of it; small images always at full. If not
+        ``anew``, pairs that have not moved since they were measured are kept.
         """
         graph, odometry = self.graph, self.tracker.map.odometry
         batch = MATCHED_TOGETHER[self.keyframes.grid.on_gpu]
@@ -107,7 +107,7 @@ class KeyframeMatches:
             graph.edges.clear()
             self.measured.clear()
         for n in range(ROUNDS if self.pairs else 0):
-            # Pairs of a keyframe one after the other: images of old ones are read from a file.
+            # Pairs are sorted by keyframe: images of old ones are read from a file.
             stale = sorted(graph.stale(self.pairs, REMEASURE))
             if len(stale) <= CONVERGED * len(self.pairs):
                 break
@@ -121,8 +121,8 @@ class KeyframeMatches:
             odometry.update_scale_by_all()
 
     def adjust(self, most: int | None = None) -> None:
-        """Solve for the free poses and depths, by that many steps at most, with all matches as
-        they are corrected now."""
+        """Solve for the free poses and depths, by at most ``most`` steps, with the present
+        corrections of all matches."""
         if self.corrections:
             self.graph.edges.update(self.corrected())
         steps = min(self.options.iterations, most or self.options.iterations)
@@ -130,7 +130,7 @@ class KeyframeMatches:
         self.graph.adjust(list(self.graph.edges), self.free_pose, self.free_depth, options)
 
     def corrected(self, but: str = "") -> Measured:
-        """The edges with all corrections, or all but one."""
+        """Return the edges with all corrections, or all but one."""
         grid, shifts = self.keyframes.grid, [s for n, s in self.corrections.items() if n != but]
         found = dict(self.measured)
         for part in in_parts(sorted(found) if shifts else [], grid.on_gpu):
@@ -141,7 +141,7 @@ class KeyframeMatches:
 
 
 def global_pairs(tracker: Tracker) -> list[Pair]:
-    """Neighbours in time and all places seen again, thinned evenly; not within a saved map."""
+    """Return pairs of neighbours in time and of revisits, thinned evenly; not within a saved map."""
     grid, ids = tracker.keyframes.grid, tracker.segment.ids
     pairs = proximity_pairs(
         tracker.keyframes,

@@ -23,10 +23,10 @@ from geogs.geometry.robust import huber_cost
 from geogs.loop.block_system import BlockEquations
 
 HUBER = 3.0
-"""Standard deviations beyond which a residual counts linearly."""
+"""Huber threshold in standard deviations."""
 FACTOR = 1e-3
-"""What the cost is multiplied by. The cells of an edge err together, so that an edge of a thousand
-cells says little more than one of them; relative poses are weighed in the same way."""
+"""Factor on the cost. Errors of an edge's cells are correlated, so that an edge of a thousand cells
+has little more information than one of them; relative poses are weighted in the same way."""
 DEPTH_DAMPING = 1e-3
 """Damping of inverse depth relative to the mean curvature of its keyframe."""
 CHUNK = 24
@@ -35,18 +35,18 @@ CHUNK = 24
 
 @dataclass(frozen=True)
 class GraphState:
-    """What a pose graph adjusts, at its present values; on the CPU, also where tracking is not."""
+    """Present values of a pose graph's unknowns; always on the CPU."""
 
     S: Float[Tensor, "n 4 4"]
     """World to camera in each keyframe's own unit of length, float64."""
     inverse_depth: Float[Tensor, "n p"] | None = None
-    """In the keyframe's unit; none without matches."""
+    """Inverse depth in the keyframe's unit; None without matches."""
 
 
 def relative_similarity(
     S: Float[Tensor, "n 4 4"], source: Int[Tensor, "e"], target: Int[Tensor, "e"]
 ) -> Float[Tensor, "e 4 4"]:
-    """S_ji = S_j S_i^-1 of every edge i -> j."""
+    """Return S_ji = S_j S_i^-1 of every edge i -> j."""
     return S[target] @ sim3_inverse(S[source])
 
 
@@ -63,12 +63,12 @@ class MatchedEdges:
     """Index of a keyframe; ascending."""
     target: Int[Tensor, "e"]
     pixels: Float[Tensor, "e p 2"]
-    """Where the cells of the source are seen in the target."""
+    """Positions of the source's cells in the target."""
     weight: Float[Tensor, "e p 2"]
     """Inverse variance of x and y, 1 / pixel^2; 0 where nothing was matched."""
 
     def linearise(self, state: GraphState) -> "LinearMatches":
-        """The edges at a state, which has inverse depths."""
+        """Linearise the edges at a state with inverse depths."""
         d = state.inverse_depth
         assert d is not None
         sources: list[LinearSource] = []
@@ -105,17 +105,17 @@ class LinearSource:
     hessian: Float[Tensor, "k 6 6"]
     gradient: Float[Tensor, "k 6"]
     depth: DepthEquations
-    """Undamped."""
+    """Undamped equations of the source's depths."""
 
     def damped_depth(self, damping: float) -> DepthEquations:
-        """With what resists a change."""
+        """Return the damped equations of the depths."""
         c = self.depth.curvature
         return replace(self.depth, curvature=c * (1 + damping) + DEPTH_DAMPING * c.mean() + 1e-12)
 
     def reduced(
         self, depth: DepthEquations
     ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m m 7 7"], Float[Tensor, "m 7"]]:
-        """Without its depths, over its keyframes: indices, blocks, gradient."""
+        """Eliminate its depths; return indices, blocks and gradient over its keyframes."""
         k = len(self.targets)
         block, g = depth.reduce(torch.block_diag(*self.hessian), self.gradient.reshape(-1))
         target = torch.eye(6, 7, dtype=torch.float64)
@@ -136,7 +136,7 @@ class LinearMatches:
     """Cells in front of their target; only these count."""
 
     def equations(self, damping: float) -> BlockEquations:
-        """Over the keyframes; depths resist by ``damping`` relative to their curvature, too."""
+        """Return equations over the keyframes; depths are damped relative to their curvature, too."""
         index = torch.zeros(0, dtype=torch.long)
         gradient = torch.zeros(self.keyframes, 7, dtype=torch.float64)
         rows, columns, blocks = [index], [index], [gradient.new_zeros(0, 7, 7)]
@@ -150,9 +150,9 @@ class LinearMatches:
         return BlockEquations(torch.cat(rows), torch.cat(columns), torch.cat(blocks), gradient)
 
     def cost(self, state: GraphState) -> float:
-        """Huber's; cells now behind their target are kept in front of it.
+        """Return Huber's cost; cells now behind their target are clamped to its front.
 
-        The cells are given, so that a step cannot lower the cost by losing some from sight.
+        The set of cells is fixed, so that a step cannot lower the cost by losing some from view.
         """
         edges, d = self.edges, state.inverse_depth
         assert d is not None
@@ -167,7 +167,7 @@ class LinearMatches:
         return FACTOR * total
 
     def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> Float[Tensor, "n p"]:
-        """Change of the inverse depths after a step of the keyframes."""
+        """Return the change of the inverse depths after a step of the keyframes."""
         delta = torch.zeros_like(self.edges.inverse_depth)
         for source in self.sources:
             relative = xi[source.targets, :6] - source.adjoint @ xi[source.source]

@@ -7,13 +7,13 @@ from jaxtyping import Bool, UInt8
 from geogs.world.loops import ImageFeatures
 
 FEATURES = 800
-"""Most of a keyframe, strongest of each image cell first: plain walls leave a few hundred."""
+"""Most features of a keyframe, strongest of each image cell first; plain walls have a few hundred."""
 FAST_THRESHOLD = 7
 """Least grey-level step of a corner: low, so that dark exposures still give features."""
 ROWS, COLUMNS = 6, 8
-"""Cells of the image that share the features evenly."""
+"""Image cells over which the features are spread evenly."""
 SURPLUS = 1.5
-"""Features detected for each that is kept, so that poor cells find theirs."""
+"""Ratio of detected to kept features, so that poor cells get theirs."""
 
 
 def orb_features(
@@ -21,9 +21,9 @@ def orb_features(
     mask: Bool[np.ndarray, "h w"] | None = None,
     most: int = FEATURES,
 ) -> ImageFeatures:
-    """Oriented FAST corners at eight scales, described by ORB; empty where nothing stands out.
+    """Detect oriented FAST corners at eight scales, described by ORB; there may be none.
 
-    Outside a ``mask`` of the size of the image nothing is found. For any thread.
+    Outside a ``mask`` of the size of the image nothing is detected. Thread-safe.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     orb = cv2.ORB.create(nfeatures=round(SURPLUS * most), fastThreshold=FAST_THRESHOLD)
@@ -38,14 +38,14 @@ def orb_features(
     described, descriptors = orb.compute(grey, kept)
     if descriptors is None:
         return ImageFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
-    # Descriptors come back in another order: OpenCV sorts by scale.
+    # Descriptors are returned in another order: OpenCV sorts by scale.
     back = np.argsort([p.class_id for p in described], kind="stable")
     pixels = np.array([p.pt for p in described], np.float32)
     return ImageFeatures(pixels[back], descriptors[back])
 
 
 def _spread(pixels: np.ndarray, strength: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Order in which every cell gives its strongest, then every cell its second, and so on."""
+    """Return an order with the strongest of every cell first, then the second of every cell, etc."""
     row = (pixels[:, 1] * ROWS / shape[0]).astype(int)
     cell = row * COLUMNS + (pixels[:, 0] * COLUMNS / shape[1]).astype(int)
     by_cell = np.lexsort((-strength, cell))

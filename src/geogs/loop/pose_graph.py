@@ -1,12 +1,12 @@
 """Sim(3) pose-graph adjustment: relative poses and dense matches over drifting keyframes.
 
-A monocular tracker drifts in scale, so every keyframe carries a similarity ``S`` from the world to
-its camera *in the keyframe's own unit of length*, lifted from its pose with scale 1. A relative
-pose G from keyframe i to j says S_j S_i^-1 = G, and errs by ``e = log(G S_i S_j^-1)`` in tangent
-order [tau, phi, sigma], in the frame of j. Loops are robust: Geman-McClure, approached from the
-convex side (graduated non-convexity, Yang et al. 2020), so that a false loop loses its weight
-instead of bending the map. Steps are Levenberg-Marquardt on left retractions, each solved sparsely;
-memory is linear in edges. Source: the Sim(3) pose graph of HI-SLAM2, with exact Jacobians.
+A monocular tracker drifts in scale, so every keyframe has a similarity ``S`` from the world to its
+camera *in the keyframe's own unit of length*, lifted from its pose with scale 1. A relative pose G
+from keyframe i to j measures S_j S_i^-1, with the error ``e = log(G S_i S_j^-1)`` in tangent order
+[tau, phi, sigma], in the frame of j. Loops are robust: Geman-McClure, approached from the convex
+side (graduated non-convexity, Yang et al. 2020), so that a false loop loses its weight instead of
+deforming the map. Steps are Levenberg-Marquardt on left retractions, each solved sparsely; memory
+is linear in edges. Source: the Sim(3) pose graph of HI-SLAM2, with exact Jacobians.
 """
 
 from collections.abc import Sequence
@@ -36,32 +36,33 @@ LOOP_THRESHOLD = 37.0
 """Squared error, in squared standard deviations, at which a loop's influence fades: twice the 99th
 percentile of chi^2 with seven degrees of freedom, so that most true loops keep most."""
 DRIFT = 9.0
-"""Factor of the covariance of trusted edges when there are loops. Odometry errs alike from step to
-step, and what a whole chain errs is more than its steps tell; a true loop would lose to it."""
+"""Factor on the covariance of trusted edges when there are loops. Odometry errors are correlated
+from step to step, so the error of a chain is larger than its steps predict; without the factor true
+loops would lose their weight."""
 CONVEXITY_STEP = 4.0
-"""Factor by which the kernel is sharpened from stage to stage."""
+"""Factor by which the kernel is narrowed from stage to stage."""
 STEPS, STAGE_STEPS = 20, 2
 """Most steps of the last stage, and of every other."""
 TOLERANCE = 1e-6
-"""A stage ends when a step lowers the cost by no more than this fraction of it, or when less than
-this is left, in squared standard deviations."""
+"""Relative decrease of the cost by a step at which a stage ends, and cost at which it ends, in
+squared standard deviations."""
 DAMPING, MAX_DAMPING = 1e-8, 1e4
-"""Levenberg damping at the start, relative to the diagonal; a stage ends when even the second
-brings no decrease."""
+"""Levenberg damping at the start, relative to the diagonal, and damping at which a stage ends if
+the cost still does not fall."""
 
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """What is adjusted."""
+    """The adjustment problem."""
 
     start: Float[Tensor, "n 4 4"]
     """World to camera of each keyframe in its own unit, float64; at first simply its pose."""
     relative: RelativePoses
     fixed: Bool[Tensor, "n"]
-    """Keyframes whose similarity stays; at least one, or the world is undetermined."""
+    """Keyframes whose similarity is fixed; at least one, or the gauge is free."""
     matches: MatchedEdges | None = None
     is_metric: bool = False
-    """Whether no unit drifts, so that all scales stay what they are at the start."""
+    """Whether units do not drift, so that all scales are fixed."""
 
 
 @dataclass(frozen=True)
@@ -71,22 +72,22 @@ class PoseGraphResult:
     S: Float[Tensor, "n 4 4"]
     """World to camera in the keyframe's unit of before, float64."""
     inverse_depth: Float[Tensor, "n p"] | None
-    """In the keyframe's unit of before; None without matches."""
+    """Inverse depth in the keyframe's unit of before; None without matches."""
     loop_weight: Float[Tensor, "e"]
-    """Weight of each relative pose by the kernel, in [0, 1]; 1 for trusted ones."""
+    """Robust weight of each relative pose, in [0, 1]; 1 for trusted ones."""
 
 
 def relative_errors(S: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e 7"]:
-    """``log(G S_i S_j^-1)`` of every relative pose."""
+    """Return ``log(G S_i S_j^-1)`` of every relative pose."""
     return sim3_log(relative.G @ S[relative.source] @ sim3_inverse(S[relative.target]))
 
 
 def relative_jacobians(
     relative: RelativePoses, error: Float[Tensor, "e 7"]
 ) -> tuple[Float[Tensor, "e 7 7"], Float[Tensor, "e 7 7"]]:
-    """d error / d xi of source and target (left perturbations), exact.
+    """Return the exact d error / d xi of source and target (left perturbations).
 
-    A motion of the source reaches the error's left through Ad(G), one of the target through
+    A motion of the source acts on the error from the left through Ad(G), one of the target through
     Ad(Exp(e)): Jl(e)^-1 Ad(G) and -Jl(e)^-1 Ad(Exp(e)) = -Jr(e)^-1 = -(Jl(e)^-1 + ad(e)).
     """
     inverse = sim3_inverse_jacobian(error)
@@ -94,7 +95,7 @@ def relative_jacobians(
 
 
 def solve(graph: PoseGraph) -> PoseGraphResult:
-    """Adjust all similarities; inverse depths of matched edges with them.
+    """Adjust all similarities, and the inverse depths of matched edges.
 
     The kernel starts so wide that it is convex over the errors of all loops at the given poses.
     Every step lowers the cost at its stage; the result is deterministic.
@@ -126,7 +127,7 @@ def solve(graph: PoseGraph) -> PoseGraphResult:
 def pose_correction(
     ids: Sequence[int], T_cw: Float[Tensor, "n 4 4"], S: Float[Tensor, "n 4 4"]
 ) -> PoseCorrection:
-    """What the rest of the system needs to know: T' = (R, t / s) and s of each keyframe.
+    """Return the correction for the rest of the system: T' = (R, t / s) and s of each keyframe.
 
     Lengths around a keyframe are divided by s, so inverse depth is multiplied by it, as
     ``KeyframeSet.correct`` does; the map follows by T'^-1 (1 / s) T = S^-1 T.
@@ -143,7 +144,7 @@ def pose_correction(
 
 @dataclass(frozen=True)
 class RelativeTerm:
-    """The term of relative poses, loops by Geman and McClure's kernel."""
+    """Term of relative poses; Geman-McClure kernel for loops."""
 
     relative: RelativePoses
     information: Float[Tensor, "e 7"]
@@ -152,7 +153,7 @@ class RelativeTerm:
 
     @staticmethod
     def of(relative: RelativePoses) -> "RelativeTerm":
-        """With the kernel of the last stage."""
+        """Return the term with the kernel of the last stage."""
         trust = 1 / DRIFT if bool(relative.is_loop.any()) else 1.0
         information = torch.where(
             relative.is_loop[:, None], relative.information, trust * relative.information
@@ -160,11 +161,11 @@ class RelativeTerm:
         return RelativeTerm(relative, information, LOOP_THRESHOLD)
 
     def widened(self, width: float) -> "RelativeTerm":
-        """With a kernel so many times as wide."""
+        """Return the term with a kernel ``width`` times as wide."""
         return replace(self, limit=width * self.limit)
 
     def widths(self, state: GraphState) -> list[float]:
-        """Widening of the kernel's limit from stage to stage; the last is 1."""
+        """Return the factors on the kernel's limit from stage to stage; the last is 1."""
         widths = [1.0]
         square = self.squares(relative_errors(state.S, self.relative))[self.relative.is_loop]
         # Geman-McClure is convex up to a third of its squared threshold.
@@ -174,16 +175,16 @@ class RelativeTerm:
         return widths
 
     def squares(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
-        """Squared errors in squared standard deviations."""
+        """Return squared errors in squared standard deviations."""
         return (self.information * error.square()).sum(-1)
 
     def robust_weights(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
-        """Geman-McClure's weight (c^2 / (c^2 + |e|^2))^2 of loops, 1 of other edges."""
+        """Return the Geman-McClure weight (c^2 / (c^2 + |e|^2))^2 of loops, 1 of other edges."""
         weight = (self.limit / (self.limit + self.squares(error))).square()
         return torch.where(self.relative.is_loop, weight, torch.ones_like(weight))
 
     def linearise(self, state: GraphState) -> "LinearRelative":
-        """The relative poses at a state."""
+        """Linearise the relative poses at a state."""
         return LinearRelative(self, state.S)
 
 
@@ -195,7 +196,7 @@ class LinearRelative:
     S: Float[Tensor, "n 4 4"]
 
     def equations(self, damping: float) -> BlockEquations:
-        """Over the keyframes."""
+        """Return equations over the keyframes."""
         relative = self.term.relative
         e = relative_errors(self.S, relative)
         J_i, J_j = relative_jacobians(relative, e)
@@ -210,7 +211,7 @@ class LinearRelative:
         return BlockEquations(torch.cat([i, j, i, j]), torch.cat([i, j, j, i]), blocks, gradient)
 
     def cost(self, state: GraphState) -> float:
-        """Sum of |e|^2 of trusted edges, of c^2 |e|^2 / (c^2 + |e|^2) of loops."""
+        """Return the sum of |e|^2 of trusted edges, and of c^2 |e|^2 / (c^2 + |e|^2) of loops."""
         term, limit = self.term, self.term.limit
         square = term.squares(relative_errors(state.S, term.relative))
         robust = torch.where(term.relative.is_loop, limit * square / (limit + square), square)
@@ -221,12 +222,12 @@ LinearTerm = LinearRelative | LinearMatches
 
 
 def _cost(state: GraphState, linear: Sequence[LinearTerm]) -> float:
-    """Sum over the terms."""
+    """Return the sum over the terms."""
     return sum(term.cost(state) for term in linear)
 
 
 class _Problem:
-    """One graph as the least-squares loop sees it; its terms change from stage to stage."""
+    """Interface of one graph to the least-squares loop; its terms change from stage to stage."""
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
@@ -235,13 +236,13 @@ class _Problem:
         """Solver of the last step; the next has the same blocks."""
 
     def linearise(self, state: GraphState) -> list[LinearTerm]:
-        """All terms."""
+        """Linearise all terms."""
         return [term.linearise(state) for term in self.terms]
 
     def step(
         self, state: GraphState, linear: Sequence[LinearTerm], damping: float
     ) -> Step[GraphState] | None:
-        """The step of all similarities and depths; None where there is no solution."""
+        """Compute the step of all similarities and depths; None where there is no solution."""
         parts = [term.equations(damping) for term in linear]
         if self.graph.is_metric:
             parts = [part.without_scale() for part in parts]

@@ -1,10 +1,10 @@
-"""Relative poses out of matched edges: what remains of an edge once its matches are let go.
+"""Conversion of matched edges to relative poses, which replace their matches.
 
-Each directed edge is solved on its own: Gauss-Newton on the motion from source to target with the
-source's depth given, linearised anew at each step. Where both keyframes know their depth, the
-matches also tell the ratio of their units, which a tracker that drifts in scale needs of its loops.
-Source: HI-SLAM2's buffer of relative poses; that linearises at the unchanged poses and knows no
-scale, this does not.
+Each directed edge is solved separately: Gauss-Newton on the motion from source to target with the
+source's depth given, linearised again at each step. Where both keyframes have depth, the matches
+also determine the ratio of their units, which loops need as a tracker drifts in scale.
+Source: HI-SLAM2's buffer of relative poses, which linearises at the unchanged poses and has no
+scale.
 """
 
 from dataclasses import dataclass
@@ -23,21 +23,21 @@ from geogs.world.grid import SampleGrid
 from geogs.world.loops import RelativePoses
 
 STEPS = 8
-"""At most."""
+"""Most steps of an edge."""
 CONVERGED = 1e-6
-"""A step in which no number of a motion changes by more is the last."""
+"""Largest change of a motion's numbers at which a step is the last."""
 MIN_WEIGHT = 0.1
-"""1 / pixel^2: from which a cell counts as matched."""
+"""Weight from which a cell counts as matched, 1 / pixel^2."""
 MIN_MATCHED = 0.01
 """Fraction of all cells that must be matched and in front of the target."""
 INDEPENDENT = 10.0
-"""Measurements that the cells of an edge amount to, as neighbours err together; the source has 1.
-Measured: 30 or more on a rendered room."""
+"""Effective number of independent measurements of an edge, as errors of neighbours are correlated;
+HI-SLAM2 has 1. Measured: 30 or more on a rendered room."""
 DAMPING = 1e-4
-"""Added to the curvature of the six numbers of the motion, relative to its diagonal."""
+"""Damping of the six numbers of the motion, relative to the diagonal."""
 LEAST_ROTATION = 2e-4
-"""Radians: least deviation of a motion, however well it fits; of a translation in the same
-proportion to the source's median depth."""
+"""Least deviation of a rotation, radians, however well it fits; of a translation the same
+fraction of the source's median depth."""
 LEAST_SCALE = 2e-3
 """Least deviation of a ratio of units."""
 
@@ -55,12 +55,13 @@ def relative_poses(
     Matches and depths may be on a GPU; poses are on the CPU, and so is the result.
 
     The solution begins at the present poses, or at ``start``, the motion of each edge in its
-    source's unit. Without ``steps`` that stays: an adjustment of all edges has found it.
+    source's unit. With zero ``steps`` the start is the result: an adjustment of all edges has found
+    it.
 
     Covariance is ``sigma^2 diag(H^-1)`` with ``sigma^2 = sum w r^2`` divided not by the number of
-    cells, but by ``INDEPENDENT``. A loop's scale is the median ratio of the depths at
-    matched cells; any other edge has scale 1, with the deviation of its worst angle or of its
-    worst translation relative to depth, whichever is larger.
+    cells, but by ``INDEPENDENT``. A loop's scale is the median ratio of the depths at matched
+    cells; any other edge has scale 1, with the deviation of its worst angle or of its worst
+    translation relative to depth, whichever is larger.
     """
     G, information, kept = [], [], []
     if start is None:
@@ -89,7 +90,7 @@ def _solve_edges(
     is_loop: bool,
     steps: int,
 ) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, "e 7"], Bool[Tensor, "e"]]:
-    """Similarity, information and whether it is worth keeping, of each edge of a chunk."""
+    """Return similarity, information and whether to keep it, of each edge of a chunk."""
     j, weight = edges.target[chunk], edges.weight[chunk]
     d = edges.inverse_depth[edges.source[chunk]]
     linearised = partial(_linearised, edges, chunk, d)
@@ -122,7 +123,7 @@ def _solve_edges(
 
 @dataclass(frozen=True)
 class _LinearEdges:
-    """Edges at some motions; equations are float64 and on the CPU."""
+    """Edges linearised at some motions; equations are float64 and on the CPU."""
 
     projection: LinearProjection
     hessian: Float[Tensor, "e 6 6"]
@@ -131,7 +132,7 @@ class _LinearEdges:
     """Robustly weighted sum of squared residuals."""
 
     def damped(self, damping: float) -> Float[Tensor, "e 6 6"]:
-        """The Hessians with raised diagonals."""
+        """Return the Hessians with raised diagonals."""
         floor = damping * self.hessian.diagonal(dim1=-2, dim2=-1) + 1e-9
         return self.hessian + torch.diag_embed(floor)
 
@@ -151,7 +152,7 @@ def _linearised(
 
 
 def _step(T: Float[Tensor, "e 4 4"], linear: _LinearEdges, damping: float) -> Step[Tensor]:
-    """A motion whose step is not finite stays."""
+    """Take a step; a motion whose step is not finite does not change."""
     step = torch.linalg.solve(linear.damped(damping), linear.gradient).nan_to_num(0.0, 0.0, 0.0)
     return Step(move(step, T), float(step.abs().max()))
 
@@ -164,7 +165,7 @@ def _depth_ratio(
     inverse_depth: Float[Tensor, "e p"],
     matched: Bool[Tensor, "e p"],
 ) -> tuple[Float[Tensor, "e"], Float[Tensor, "e"]]:
-    """Log of a length in the target's unit over the same in the source's, and its variance.
+    """Return the log ratio of a length in the target's unit to the source's, and its variance.
 
     The median over matched cells that fall into the target, and the square of the median deviation,
     not divided by the number of cells. NaN where there is no such cell.

@@ -1,4 +1,4 @@
-"""Which earlier keyframes look like an image: an inverted index over binary words."""
+"""Retrieval of keyframes similar to an image, by an inverted index over binary words."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ from jaxtyping import Float64, Int64
 from geogs.world.loops import ImageFeatures, Vocabulary
 
 INDEXED = 300
-"""Features of an image that are looked up and stored, strongest first; the rest serve to verify."""
+"""Features of an image that are looked up and stored, strongest first; the rest are for matching."""
 WORD_RADIUS = 50
 """Bits (of 256) within which a descriptor belongs to an existing word."""
 WORDS = 6144
 """Size at which the vocabulary stops growing; bounds the cost of a keyframe."""
 LOOSE = 15
-"""Bits by which the radius of the words grows once the vocabulary is full."""
+"""Increase of the words' radius, in bits, once the vocabulary is full."""
 
 
 class Posting:
-    """The keyframes that hold a word: their rows, and how often they hold it."""
+    """Keyframes that contain a word: their rows, and counts."""
 
     def __init__(self) -> None:
         self._room = np.zeros((4, 2), np.int64)
@@ -30,11 +30,11 @@ class Posting:
 
     @property
     def rows(self) -> Int64[np.ndarray, "m 2"]:
-        """Row and how often, earliest first."""
+        """Row and count of each keyframe, earliest first."""
         return self._room[: self._count]
 
     def add(self, row: int, count: int) -> None:
-        """Enter a keyframe."""
+        """Add a keyframe."""
         if self._count == len(self._room):
             self._room = np.concatenate([self._room, np.zeros_like(self._room)])
         self._room[self._count] = row, count
@@ -47,34 +47,34 @@ class SimilarKeyframe:
 
     keyframe: int
     score: float
-    """Shared tf-idf mass, of the query's own: 0 nothing in common, 1 the same image."""
+    """Shared tf-idf mass over the query's own: 0 nothing in common, 1 the same image."""
 
 
 class AppearanceIndex:
-    """Keyframes by the words they contain.
+    """Index of keyframes by the words they contain.
 
     The vocabulary needs no training data: a descriptor farther than ``WORD_RADIUS`` bits from
     every word becomes a word itself (as in iBoW-LCD, Garcia-Fidalgo & Ortiz 2018, without its
-    merging of words). Words that many keyframes share count little (inverse document frequency).
+    merging of words). Words common to many keyframes count little (inverse document frequency).
     """
 
     def __init__(self, vocabulary: Vocabulary | None = None, most_words: int = WORDS) -> None:
-        """Goes on with what a ``vocabulary`` has."""
+        """Continue with a ``vocabulary``, if given."""
         self._most_words = most_words
         self._vocabulary = v = vocabulary or Vocabulary()
         self._postings = [Posting() for _ in v.words]
-        """Inverted index: the keyframes of each word."""
+        """Inverted index: keyframes of each word."""
         self._row = {keyframe: row for row, keyframe in enumerate(v.keyframes)}
         for row, counts in enumerate(v.counts):
             self._post(row, counts)
         self._recent: tuple[ImageFeatures, np.ndarray, np.ndarray] | None = None
-        """Features last looked up with their words: a keyframe is queried, then added."""
+        """Features looked up last, with their words: a keyframe is queried, then added."""
 
     def __len__(self) -> int:
         return len(self._vocabulary.keyframes)
 
     def add(self, keyframe: int, features: ImageFeatures) -> None:
-        """Enter a keyframe; what is new in it becomes words."""
+        """Add a keyframe; its new descriptors become words."""
         descriptors = features.descriptors[:INDEXED]
         words, distance = self._nearest(features)
         v = self._vocabulary
@@ -95,7 +95,7 @@ class AppearanceIndex:
     def query(
         self, features: ImageFeatures, exclude: Collection[int] = (), count: int = 5
     ) -> list[SimilarKeyframe]:
-        """The ``count`` keyframes most similar to an image that are not excluded, best first."""
+        """Return the ``count`` keyframes most similar to an image, without excluded, best first."""
         score = self._scores(features)
         score[[self._row[k] for k in exclude if k in self._row]] = 0.0
         best = np.argsort(-score, kind="stable")[:count]
@@ -110,11 +110,11 @@ class AppearanceIndex:
             self._postings[word].add(row, count)
 
     def _scores(self, features: ImageFeatures) -> Float64[np.ndarray, "rows"]:
-        """Similarity of every row to an image."""
+        """Return the similarity of every row to an image."""
         rows = len(self)
         words, distance = self._nearest(features)
         known = distance <= self._radius
-        # A word that no keyframe has yet still belongs to what the image is.
+        # Descriptors without a word still count in the image's own mass.
         own = float((~known).sum()) * np.log((rows + 1) / 0.5)
         containing, mass = [np.zeros(0, np.int64)], [np.zeros(0)]
         for word, count in _counts(words[known]).tolist():
@@ -134,7 +134,7 @@ class AppearanceIndex:
     def _nearest(
         self, features: ImageFeatures
     ) -> tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]:
-        """Nearest word of each indexed descriptor and its distance in bits; 257 without a word."""
+        """Return the nearest word of each descriptor and its distance in bits; 257 without any."""
         from geogs.loop.hamming_kernels import two_nearest
 
         if self._recent is not None and self._recent[0] is features:
@@ -146,5 +146,5 @@ class AppearanceIndex:
 
 
 def _counts(words: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "c 2"]:
-    """Each word with how often it occurs, by word."""
+    """Return each word with its count, sorted by word."""
     return np.column_stack(np.unique(words, return_counts=True))

@@ -1,4 +1,4 @@
-"""Place recognition: the part of loop detection that needs no flow, concurrent with tracking."""
+"""Place recognition: the part of loop detection without flow, concurrent with tracking."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,12 +21,12 @@ from geogs.world.grid import SampleGrid
 from geogs.world.loops import ImageFeatures, LoopCandidate, LoopTable, VerifiedCandidate
 
 MIN_SCORE = 0.05
-"""Least similarity of a candidate by appearance, of that of a keyframe with itself."""
+"""Least similarity of a candidate by appearance, relative to a keyframe's with itself."""
 VERIFIED = 4
 """Most candidates of a keyframe that are verified: bounds the cost."""
 SUPPRESSION = 3
-"""A loop rules out others whose ends together lie within this many keyframes of its own, as they
-say nothing new."""
+"""Distance in keyframes, summed over both ends, within which a loop suppresses others as
+redundant."""
 
 Depths = Mapping[int, tuple[Float[Tensor, "p"], Float[Tensor, "p"]]]
 """Inverse depth and information on the grid, by keyframe."""
@@ -34,24 +34,24 @@ Depths = Mapping[int, tuple[Float[Tensor, "p"], Float[Tensor, "p"]]]
 
 @dataclass(frozen=True)
 class Query:
-    """A keyframe to search loops for; nothing in it changes any more."""
+    """A keyframe to search loops for; immutable."""
 
     id: int
     features: Future[ImageFeatures]
     """Features of its image."""
     near: frozenset[int]
-    """Keyframes that cannot be its loops, for being of the same time."""
+    """Keyframes excluded as loops, as they are near in time."""
     by_pose: tuple[int, ...]
-    """Keyframes that the poses say are seen again, nearest first."""
+    """Keyframes revisited by the present poses, nearest first."""
     known: tuple[Pair, ...]
     """Loops found so far."""
     settled: tuple[Pair, ...]
-    """Pairs near which nothing new can be said."""
+    """Pairs near which loops would be redundant."""
     depths: Depths
 
 
 class PlaceRecognition:
-    """Remembers keyframes by their features, and finds those that a new one may show again."""
+    """Indexes keyframes by their features, and finds those that a new one may revisit."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class PlaceRecognition:
         table: LoopTable,
     ) -> None:
         """``order`` is the rank in time of each keyframe; it may grow meanwhile. Outside a
-        ``mask`` of the size of the images no features are found."""
+        ``mask`` of the size of the images no features are detected."""
         self.table = table
         self.grid = grid
         self.config = config
@@ -73,19 +73,19 @@ class PlaceRecognition:
         self._helpers = ThreadPoolExecutor(
             min(worker_count(), VERIFIED), thread_name_prefix="recognition"
         )
-        """Find features before their keyframe's turn, and hold several pairs together at once."""
+        """Threads that detect features ahead of time, and verify several pairs at once."""
 
     def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Future[ImageFeatures]:
-        """What a keyframe is remembered by, as soon as somebody has the time to find it."""
+        """Detect the features of a keyframe in a helper thread."""
         return self._helpers.submit(orb_features, image, self._mask)
 
     def remember(self, id: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Remember a keyframe, whatever it may show again."""
+        """Index a keyframe without searching its loops."""
         self.table.features[id] = orb_features(image, self._mask)
         self.index.add(id, self.table.features[id])
 
     def find(self, query: Query) -> None:
-        """Remember a keyframe, and the pairs it makes with earlier ones, most promising first."""
+        """Index a keyframe, and store its candidate pairs with earlier ones, most promising first."""
         id = query.id
         self.table.features[id] = query.features.result()
         candidates = self._candidates(query)
@@ -97,7 +97,7 @@ class PlaceRecognition:
         self.table.found.append(verified)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"], depths: Depths) -> list[Recognition]:
-        """Keyframes that show what an image shows, with its pose; most alike first."""
+        """Return keyframes recognised in an image, with its pose; most similar first."""
         features, found = orb_features(image, self._mask), []
         for id in self._similar(features, frozenset()):
             view = self._verifier.verify(self._view(id, depths), FeatureView(features))
@@ -106,7 +106,7 @@ class PlaceRecognition:
         return found
 
     def is_suppressed(self, pair: Pair, found: Sequence[Pair], settled: Sequence[Pair]) -> bool:
-        """Whether a pair is too near to one that was found, or is settled, to say anything new."""
+        """Whether a pair is redundant, being near to one that was found or is settled."""
         near = chain(((p, SUPPRESSION) for p in found), ((p, REACH) for p in settled))
         a, b = (self._order[k] for k in pair)
         return any(
@@ -115,7 +115,8 @@ class PlaceRecognition:
         )
 
     def _candidates(self, query: Query) -> list[LoopCandidate]:
-        """Pairs of a keyframe with earlier ones, thinned: geometry and appearance take turns."""
+        """Return pairs of a keyframe with earlier ones, thinned, by geometry and appearance in turn.
+        """
         id, by_pose = query.id, query.by_pose
         by_appearance = self._similar(self.table.features[id], query.near)
         alternating: list[LoopCandidate] = []
@@ -136,7 +137,7 @@ class PlaceRecognition:
         return chosen[:VERIFIED]
 
     def _similar(self, features: ImageFeatures, excluded: frozenset[int]) -> list[int]:
-        """Keyframes that look alike, most alike first."""
+        """Return keyframes of similar appearance, most similar first."""
         found = self.index.query(features, excluded, self.config.appearance)
         return [c.keyframe for c in found if c.score >= MIN_SCORE]
 

@@ -1,4 +1,4 @@
-"""Places seen again of which a further look would say nothing new."""
+"""Revisited places at which a further search would be redundant."""
 
 from collections.abc import Collection
 
@@ -10,10 +10,10 @@ from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import RelativePoses
 
 REACH = 8
-"""Keyframes, those of both ends together, within which of a settled pair others are settled, too:
-what can drift between them is a small part of what drifted between its ends."""
+"""Distance in keyframes, summed over both ends, from a settled pair within which others are settled,
+too: the drift between them is a small part of that between its ends."""
 RECENT = 64
-"""Latest keyframes among which the later ends are: more than any that is looked at."""
+"""Number of latest keyframes considered as later ends: more than are ever searched."""
 
 
 def settled_pairs(
@@ -23,12 +23,12 @@ def settled_pairs(
     min_gap: int,
     min_change: float,
 ) -> list[Pair]:
-    """Pairs of recent keyframes with older ones, earlier id first, whose motion is known.
+    """Return pairs of recent keyframes with older ones, earlier id first, whose motion is known.
 
-    By a loop whose relative poses, between ids, lie within ``min_change`` (radians, parts of the
-    median depth, or of the scale) of the present poses, so that no keyframe would be moved by more;
-    or by matches that tracking has, or had, between keyframes ``min_gap`` or more apart, which
-    the present poses fit.
+    It is known from a loop whose relative poses, between ids, are within ``min_change`` (radians,
+    fraction of the median depth, or of the scale) of the present poses, so that no keyframe would
+    move by more; or from present or former matches of tracking between keyframes ``min_gap`` or
+    more apart, to which the present poses are fitted.
     """
     ids = segment.ids
     if len(ids) <= min_gap:

@@ -1,4 +1,4 @@
-"""Whether two keyframes show one place, and how the cameras stood to each other."""
+"""Feature-based verification that two keyframes show the same place, with their relative pose."""
 
 from dataclasses import dataclass, replace
 
@@ -13,42 +13,43 @@ from geogs.world.grid import SampleGrid
 from geogs.world.loops import ImageFeatures, TwoViewMatch
 
 MATCH_RATIO = 0.87
-"""A match must be this much nearer than the second nearest descriptor: looser than Lowe's 0.8,
-since the pose sorts out what is wrong."""
+"""Largest ratio of the distances to the nearest and second nearest descriptor: looser than Lowe's
+0.8, since the pose rejects wrong matches."""
 MAX_REPROJECTION = 0.006
-"""Largest error of an inlier of a resected pose, of the long edge: ORB's corners of coarse scales
-are found less exactly than finest ones."""
+"""Largest error of an inlier of a resected pose, as a fraction of the long edge: ORB corners of
+coarse scales are less precise than the finest ones."""
 MAX_EPIPOLAR = 0.002
-"""Largest distance of an inlier from its epipolar line, of the long edge: one pixel of 512."""
+"""Largest distance of an inlier from its epipolar line, as a fraction of the long edge: one pixel
+of 512."""
 MIN_INLIERS = 15
 """Fewest matches that agree with the pose."""
 MIN_INLIERS_WITHOUT_DEPTH = 25
-"""The same where no depth is known and a match binds only half as much."""
+"""Fewest where no depth is known, as a match then gives only half the constraints."""
 MIN_INLIER_RATIO = 0.3
-"""Least fraction of all matches that do."""
+"""Least fraction of all matches that agree with the pose."""
 MIN_SPREAD = 0.25
-"""Least fraction of the cells of the raster that hold inliers, in the poorer image: one picture
-that hangs in two rooms is no loop."""
+"""Least fraction of the raster's cells that contain inliers, in the poorer image: one picture that
+hangs in two rooms is no loop."""
 DEPTH_TOLERANCE = 0.15
 """Relative deviation within which an inlier's depths in both views agree, up to one scale: more
-than tracked depth is wrong by."""
+than the error of tracked depth."""
 MIN_CONSISTENT = 0.6
-"""Least fraction of the inliers with depth in both views for which they do."""
+"""Least fraction of the inliers with depth in both views whose depths agree."""
 MAX_SCALE = 3.0
 """Largest factor between the scales of both views' depths, either way: drift is less."""
 RASTER = 4
-"""Cells per side in which the spread of the inliers is counted."""
+"""Cells per side of the raster that measures the spread of the inliers."""
 ITERATIONS = 300
 """Samples drawn for a pose."""
 
 
 @dataclass(frozen=True)
 class FeatureView:
-    """A view's features and what is known of their depth."""
+    """A view's features and their depths."""
 
     features: ImageFeatures
     depth: Float32[np.ndarray, "n"] | None = None
-    """z of each feature; 0 where unknown. None if nothing is known."""
+    """z of each feature; 0 where unknown. None if no depth is known."""
 
     @staticmethod
     def of(
@@ -57,7 +58,7 @@ class FeatureView:
         information: Float[Tensor, "p"],
         features: ImageFeatures,
     ) -> "FeatureView":
-        """Depth of the features from a keyframe's; known where its nearest cell has information."""
+        """Take depths from a keyframe; known where the nearest cell has information."""
         points = torch.from_numpy(features.pixels).to(grid.device)
         inverse = grid.sample_field(inverse_depth[:, None], points)[:, 0]
         cell, inside = grid.cells_of(points)
@@ -75,7 +76,7 @@ class TwoViewVerifier:
         self._edge = camera.long_edge
 
     def verify(self, first: FeatureView, second: FeatureView) -> TwoViewMatch:
-        """Pose of the second view from matches with the first.
+        """Estimate the pose of the second view from matches with the first.
 
         With depth in the first view by PnP, metric; otherwise by the essential matrix. Depth in
         both must agree at the inliers up to one scale, which is returned.
@@ -111,9 +112,9 @@ class TwoViewVerifier:
         return replace(view, accepted=not reason, reason=reason)
 
     def _match(self, first: ImageFeatures, second: ImageFeatures) -> Int64[np.ndarray, "m 2"]:
-        """Mutual nearest descriptors that are clearly nearer than the second nearest."""
+        """Match mutual nearest descriptors that pass the ratio test."""
         there = _distinct(first.descriptors, second.descriptors)
-        # The way back is only asked of those that were hit.
+        # The reverse search is only done for matched targets.
         hit, at = np.unique(there[:, 1], return_inverse=True)
         back = _distinct(second.descriptors[hit], first.descriptors)
         origin = np.full(len(hit), -1)
@@ -123,7 +124,7 @@ class TwoViewVerifier:
     def _points(
         self, pixels: Float32[np.ndarray, "m 2"], depth: Float32[np.ndarray, "m"]
     ) -> Float64[np.ndarray, "m 3"]:
-        """Points of the camera frame."""
+        """Return points in the camera frame."""
         c, z = self.camera, depth.astype(np.float64)
         x, y = (pixels[:, 0] - c.cx) / c.fx, (pixels[:, 1] - c.cy) / c.fy
         return np.stack([x * z, y * z, z], -1)
@@ -134,7 +135,7 @@ class TwoViewVerifier:
         b: Float32[np.ndarray, "m 2"],
         depth: Float32[np.ndarray, "m"],
     ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
-        """Pose by RANSAC over three points, refined on its inliers."""
+        """Estimate the pose by RANSAC over three points, refined on its inliers."""
         points, image = self._points(a, depth), b.astype(np.float64)
         limit = MAX_REPROJECTION * self._edge
         ok, r, t, chosen = cv2.solvePnPRansac(
@@ -160,7 +161,7 @@ class TwoViewVerifier:
     def _epipolar(
         self, a: Float32[np.ndarray, "m 2"], b: Float32[np.ndarray, "m 2"]
     ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
-        """Pose by MAGSAC over essential matrices; the translation has length one."""
+        """Estimate the pose by MAGSAC over essential matrices; the translation has length one."""
         E, mask = cv2.findEssentialMat(
             a.astype(np.float64),
             b.astype(np.float64),
@@ -196,7 +197,7 @@ class TwoViewVerifier:
     def _scale(
         self, own: Float32[np.ndarray, "m"], predicted: Float64[np.ndarray, "m"]
     ) -> tuple[float | None, str]:
-        """Median ratio of the second's depth to the first's, and a refusal if few keep to it."""
+        """Return the median ratio of the second's depth to the first's, and why it is rejected."""
         known = own > 0
         if int(known.sum()) < MIN_INLIERS // 2:
             return None, ""
@@ -213,7 +214,7 @@ class TwoViewVerifier:
 def _distinct(
     source: UInt8[np.ndarray, "n 32"], target: UInt8[np.ndarray, "m 32"]
 ) -> Int64[np.ndarray, "d 2"]:
-    """Descriptors with their nearest in the target, where that is clearly nearer than others."""
+    """Return descriptors and their nearest in the target, where the ratio test passes."""
     from geogs.loop.hamming_kernels import two_nearest
 
     index, nearest, second = two_nearest(source.view(np.uint64), target.view(np.uint64))

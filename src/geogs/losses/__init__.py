@@ -1,1 +1,1 @@
-"""Losses of the map: value and gradient in one go for the mapper, in ``cpu`` and ``cuda``."""
+"""Losses of the map: value and gradient in one pass for the mapper, in ``cpu`` and ``cuda``."""

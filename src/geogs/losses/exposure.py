@@ -1,4 +1,4 @@
-"""Exposure of one view against another, as a gain and an offset, and the noise of both."""
+"""Exposure of one view relative to another, as a gain and an offset, and the noise of both."""
 
 from pathlib import Path
 
@@ -11,18 +11,18 @@ from geogs.gpu.kernels import kernels_for
 _SOURCE = Path(__file__).parent / "cuda" / "light.cu"
 _ROUNDS = 12
 _SCALE = 0.02
-"""Grey values that a pixel may be off; surfaces that hide each other are off by more."""
+"""Scale of the residuals of grey values; surfaces that hide each other differ by more."""
 _PLAIN = 0.01
-"""Standard deviation of grey values below which a gain cannot be told from an offset."""
+"""Standard deviation of grey values below which gain and offset cannot be distinguished."""
 _FEWEST = 50
-"""Weights of pixels, summed, that tell anything."""
+"""Least sum of the pixels' weights for an estimate."""
 _LARGEST_GAIN = 8.0
 USUAL_NOISE = 1e-4
-"""Variance of grey values (of 1) by which two views of a place differ where nobody measured it."""
+"""Default variance of the noise of grey values (of 1), where it was not measured."""
 LEAST_NOISE = 1e-6
-"""Variance about that of rounding to 8 bits."""
+"""Least variance of the noise, about that of rounding to 8 bits."""
 _MEDIAN_TO_DEVIATION = 1.4826
-"""Standard deviation over the median of the absolute value, normal distribution."""
+"""Ratio of standard deviation to median absolute value, normal distribution."""
 _THREADS = 1024
 """Threads of the one block, as many as one may have."""
 
@@ -35,12 +35,12 @@ def identity_exposure(device: torch.device | str) -> Float[Tensor, "3"]:
 def relative_exposure(
     grey: Float[Tensor, "n"], other: Float[Tensor, "n"], usable: Bool[Tensor, "n"]
 ) -> Float[Tensor, "2"]:
-    """Gain and offset by which most of some grey values become those of another view.
+    """Estimate the gain and offset that bring most grey values to those of another view.
 
-    The line through both is fitted to either's errors alike (total least squares): a plain
-    regression takes noise for a smaller gain, and along a chain of views these multiply. Pixels
-    that do not agree lose their weight (Cauchy's), and where the values hardly differ the gain
-    stays near 1. Returns gain 1 and offset 0 where too few pixels agree. Nothing waits for a GPU.
+    The fit of the line allows errors in both values alike (total least squares): with noise a
+    plain regression underestimates the gain, and along a chain of views these errors multiply.
+    Pixels that do not agree lose their weight (Cauchy's), and where the values hardly vary the
+    gain stays near 1. Returns gain 1 and offset 0 if too few pixels agree. Does not wait for a GPU.
     """
     if grey.device.type == "cuda":
         return relative_exposure_on_gpu(grey, other, usable)
@@ -49,7 +49,7 @@ def relative_exposure(
         total = weight.sum().clamp(min=1e-12)
         mean_x, mean_y = (weight * grey).sum() / total, (weight * other).sum() / total
         x, y = grey - mean_x, other - mean_y
-        # As if as much again of a texture that is equal in both were seen.
+        # As if both also showed an equal texture of deviation ``_PLAIN``.
         xx, yy, xy = (
             (weight * a * b).sum() / total + _PLAIN**2 for a, b in ((x, x), (y, y), (x, y))
         )
@@ -57,7 +57,7 @@ def relative_exposure(
         gain = (apart + (apart.square() + 4 * xy.square()).sqrt()) / (2 * xy.clamp(min=1e-9))
         gain = gain.clamp(1 / _LARGEST_GAIN, _LARGEST_GAIN)
         residual = (y - gain * x) / (1 + gain.square()).sqrt()
-        # Wide at first, so that the start, where all count, does not decide.
+        # Wide at first, so that the start, where all count, is not decisive.
         scale = _SCALE * max(1.0, 4.0 * (1 - n / (_ROUNDS / 2)))
         weight = usable / (1 + (residual / scale).square())
     found = torch.stack([gain, mean_y - gain * mean_x])
@@ -82,11 +82,11 @@ def noise_between(
     texture: Float[Tensor, "n"],
     usable: Bool[Tensor, "n"],
 ) -> Float[Tensor, ""]:
-    """Variance of the noise in the grey values of either of two views of the same exposure.
+    """Variance of the noise in the grey values of each of two views of the same exposure.
 
     From the median difference of their grey values where the first has least ``texture``, so that
-    pixels that are not quite in place do not count for noise. The usual noise where too few can be
-    compared. Nothing waits for a GPU.
+    slightly misaligned pixels do not count as noise. The usual noise if too few can be compared.
+    Does not wait for a GPU.
     """
     order = torch.where(usable, texture, torch.inf).argsort(stable=True)
     bare = usable.sum() // 4

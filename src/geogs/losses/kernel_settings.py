@@ -18,7 +18,7 @@ NCC_VARIANCE_FLOOR = 1e-5
 NCC_MIN_VARIANCE = 1e-8
 """Windows of the reference with less grey variance have no texture to correlate."""
 MIN_COVERAGE = 0.7
-"""Windows of which a smaller fraction is valid are left out: little is left to compare."""
+"""Least valid fraction of a window; in others too little is left to compare."""
 
 
 class SingleViewSettings(NamedTuple):
@@ -58,7 +58,7 @@ class PhotoSettings(NamedTuple):
     """Relative depth difference from which a pixel is hidden."""
     l1: float
     huber: float
-    """Difference up to which L_1 is quadratic over the deviation of the reference's noise."""
+    """Difference up to which L_1 is quadratic, in standard deviations of the reference's noise."""
     cut: float
     ncc: float
     reject: float
@@ -90,7 +90,7 @@ def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> Sin
 
 
 def photo_settings(config: LossConfig, camera: Camera, weight: float = 1.0) -> PhotoSettings:
-    """Settings for pairs of a camera's photometric images, each of which counts ``weight``."""
+    """Settings for pairs of a camera's photometric images, each pair with this ``weight``."""
     c, pixels = config, camera.width * camera.height
     return PhotoSettings(
         camera.fx, camera.fy, camera.cx, camera.cy,

@@ -17,7 +17,7 @@ from geogs.losses.exposure import USUAL_NOISE
 
 # A point must keep this fraction of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
-# Degrees between the rays of two views at which a tolerance in pixels is one in depth.
+# Angle in degrees between the rays of two views that converts a tolerance in pixels to depth.
 _PARALLAX = 10.0
 _TEXTURE_SIDE = 5
 """Side in pixels of the window whose variance is a pixel's texture."""
@@ -34,7 +34,7 @@ class PhotoView:
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
     texture: Float[Tensor, "h w"]
-    """Variance of the grey values around each pixel over that of their noise; float32."""
+    """Ratio of the variance of grey values around each pixel to that of their noise; float32."""
     noise: Float[Tensor, ""]
     """Variance of the noise in the grey values."""
     colours: Float[Tensor, "3 h w"] | None = None
@@ -51,7 +51,7 @@ class PhotoView:
     ) -> "PhotoView":
         """View of an RGB image (any size) by ``camera``, whose size is the photometric size.
 
-        ``blur`` is the standard deviation in pixels of a Gaussian that takes out what bilinear
+        ``blur`` is the standard deviation in pixels of a Gaussian that removes detail that bilinear
         interpolation would alias. The grey image is put on ``device``.
         """
         if min(camera.width, camera.height) < 16:
@@ -91,7 +91,7 @@ class PhotoView:
         return torch.cat([self.grey[None], self.colours])
 
     def plane(self, k: int) -> "PhotoView":
-        """The view with one of its ``planes`` for the grey image."""
+        """The view with one of its ``planes`` in place of the grey image."""
         if k == 0:
             return self
         assert self.colours is not None, "the view has no colours"
@@ -102,8 +102,8 @@ class PhotoView:
         return replace(self, T_cw=T_cw)
 
     def with_exposure(self, exposure: Float[Tensor, "3"]) -> "PhotoView":
-        """The same image with its values times a gain plus an offset, and the variance of the noise
-        that this leaves."""
+        """The same image with its values times a gain plus an offset, and the noise variance after
+        that."""
         gain, offset, noise = exposure
         colours = None if self.colours is None else gain * self.colours + offset
         texture = self.texture * (gain.square() * self.noise / noise)
@@ -146,10 +146,10 @@ def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
 
 
 def occlusion_tolerance(config: LossConfig, camera: Camera) -> float:
-    """Relative depth difference from which a pixel is hidden: tau, or what moves a point by so many
-    pixels between views 10 degrees apart.
+    """Relative depth difference from which a pixel is hidden: tau, or the difference that moves a
+    point by ``config.occlusion`` pixels between views 10 degrees apart.
 
-    So the occlusion test is as sharp as depths can be: a camera with a long lens sees finer steps.
+    The occlusion test is then as sharp as depths can be: a long lens resolves finer steps.
     """
     pixels = config.occlusion
     return config.occlusion_ratio or pixels / (camera.fx * math.tan(math.radians(_PARALLAX)))

@@ -19,7 +19,7 @@ MIN_ALPHA = 0.5
 SMOOTHNESS_ETA = 10.0
 """Decay of smoothness with the image gradient (image in [0, 1]); the paper's eta."""
 OUTSIDE = -1.0
-"""Prior depth where a mask says that nothing of the scene is."""
+"""Prior depth of pixels that a mask excludes from the scene."""
 ONE_SURFACE = 0.08
 """Largest relative difference of inverse depth within a pixel of half the resolution that has one
 depth."""
@@ -69,7 +69,7 @@ class ViewConstants:
 
     @functools.cached_property
     def halved(self) -> "ViewConstants":
-        """The same for maps of half the resolution.
+        """The constants for maps of half the resolution.
 
         A pixel's depth, confidence and normal are means of those in it, and unknown where some are
         unknown or of another surface; it is ``OUTSIDE`` where most of it is.
@@ -115,7 +115,7 @@ def edge_strength(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
 def gradient_norm(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "h w"]:
     """1-norm of the forward differences per pixel, mean over channels; 0 in the last row, column.
 
-    Of an image in grey values per pixel, of a depth map in its unit per pixel.
+    For an image in grey values per pixel, for a depth map in its unit per pixel.
     """
     channels = image if image.ndim == 3 else image[..., None]
     horizontal = (channels[:-1, 1:] - channels[:-1, :-1]).abs()

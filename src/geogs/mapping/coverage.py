@@ -1,8 +1,8 @@
 """Selection of the images that make a map: those that cover it from all sides.
 
-The scene is represented by points. An image gains at a point that no chosen image sees yet, and
-where its ray makes an angle with theirs from which depth can be triangulated. Images are chosen
-greedily by their gain, so that every beginning of the order is a good choice of that many.
+The scene is represented by points. An image gains by each point that no chosen image sees yet, and
+by each ray at an angle to theirs that allows triangulation. Images are chosen greedily by their
+gain, so for any n the first n of the order are a good choice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,20 +14,20 @@ from jaxtyping import Float32, Float64, Int64
 from geogs.depth.sweep_neighbors import BEST_PARALLAX_DEG, MAX_PARALLAX_DEG
 from geogs.geometry.camera import Camera
 
-# Rays of each image that make points of the scene, across and down.
+# Rays per image that make scene points, across and down.
 _ACROSS, _DOWN = 4, 3
-# Most points of the scene by default, and how many of their cells the usual depth spans.
+# Most scene points by default, and the number of their cells that the typical depth spans.
 _POINTS, _CELLS = 1000, 10.0
-# A point counts as seen from 1/x to x times the depth that is usual in the image.
+# A point counts as seen at 1/x to x times the typical depth of the image.
 _DEPTHS = 3.0
-# Angle between rays from which they see different sides, degrees.
+# Least angle between rays that see different sides, degrees.
 _SAME_SIDE = 75.0
-# Worth of a point that one image sees, over one that two see well; and of one whose rays are too
-# far apart to be matched.
+# Value of a point that one image sees, relative to one that two see well; value of one whose rays
+# are too far apart to be matched.
 _ALONE, _UNMATCHED = 0.5, 0.5
-# Newness below which an image is taken for a copy of those that were chosen.
+# Newness below which an image counts as a copy of chosen ones.
 _COPY = 0.02
-# Nearest images whose detail is compared; least worth of a blurred one.
+# Nearest images whose detail is compared; least factor of a blurred one.
 _ALIKE, _LEAST_SHARP = 6, 0.3
 
 
@@ -51,7 +51,7 @@ def scene_points(
     random: np.random.Generator,
     most: int = _POINTS,
 ) -> Float64[np.ndarray, "p 3"]:
-    """Evenly spread points of the scene, at the usual depth of each image; ``most`` of them."""
+    """At most ``most`` evenly spread points of the scene, at the typical depth of each image."""
     u = (np.arange(_ACROSS) + 0.5) / _ACROSS * camera.width
     v = (np.arange(_DOWN) + 0.5) / _DOWN * camera.height
     x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
@@ -71,7 +71,7 @@ def sightings(
     typical: Float64[np.ndarray, "v"],
     points: Float64[np.ndarray, "p 3"],
 ) -> Sightings:
-    """Points in the image of each camera at about its usual depth."""
+    """Find the points that each camera sees at about its typical depth."""
     point, view, ray = [], [], []
     for i, T in enumerate(T_cw):
         x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
@@ -92,13 +92,13 @@ def sightings(
 def coverage_order(
     seen: Sightings, sharpness: Float64[np.ndarray, "v"], copy: float = _COPY
 ) -> Iterator[int]:
-    """Indices of the images, the one of most gain first; copies of chosen ones are left out.
+    """Yield image indices, the largest gain first; copies of chosen ones are left out.
 
     Args:
-        seen: which points the images see.
+        seen: the points that each image sees.
         sharpness: factor on the gain of each image, at most 1.
-        copy: newness of an image's rays, in the mean, up to which it is a copy; that of a ray is
-            its angle to the nearest chosen one, over the best for matching, at most 1.
+        copy: mean newness of an image's rays up to which it is a copy; the newness of a ray is its
+            angle to the nearest chosen one over the best for matching, at most 1.
     """
     points = int(seen.point.max(initial=-1)) + 1
     begin = np.searchsorted(seen.point, np.arange(points + 1))
@@ -134,7 +134,7 @@ def coverage_order(
 
 
 def _newness(cosine: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """Worth of a ray by its angle to the nearest chosen one: 0 if it is the same."""
+    """Newness of a ray by its angle to the nearest chosen one: 0 if it is the same."""
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     matched = np.minimum(angle / BEST_PARALLAX_DEG, 1.0)
     matched = np.where(angle > MAX_PARALLAX_DEG, _UNMATCHED, matched)
@@ -142,19 +142,19 @@ def _newness(cosine: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 
 
 def _worth(count: Int64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """Worth of another ray to points that so many see; the second one counts most."""
+    """Value of one more ray to points that ``count`` images see; the second ray counts most."""
     return np.where(count == 0, _ALONE, 1.0 / np.maximum(count, 1))
 
 
 def relative_sharpness(
     T_cw: Float64[np.ndarray, "v 4 4"], typical: float, detail: Sequence[int]
 ) -> Float64[np.ndarray, "v"]:
-    """Detail of each image over the median of those taken next to it; at most 1.
+    """Ratio of each image's detail to the median of the nearest images; at most 1.
 
     Args:
         T_cw: poses of the images.
-        typical: the usual depth, which makes translations comparable with rotations.
-        detail: of each image, such as its compressed size.
+        typical: the typical depth, which makes translations comparable with rotations.
+        detail: a measure of it for each image, such as the compressed size.
     """
     own = np.asarray(detail, np.float64)
     if len(own) <= _ALIKE:

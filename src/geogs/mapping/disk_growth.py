@@ -42,17 +42,17 @@ class DiskGrowth:
             disks.keep(self.depths.keep(disks.position.detach(), views))
 
     def prune(self, views: Sequence[MapView]) -> None:
-        """Drop transparent and broken disks, too."""
+        """Carve, and drop transparent and broken disks."""
         self.table.disks.keep(worth_keeping(self.table.disks))
         self.carve(views)
 
     @torch.no_grad()
     def start(self, points: Float[Tensor, "n 3"], views: Sequence[MapView]) -> None:
-        """Disks at sparse points of the scene, each of the keyframe that lies nearest to it."""
+        """Add disks at sparse points of the scene, each assigned to the nearest keyframe."""
         disks = self.table.disks
         centres = torch.stack([view.T_wc[:3, 3] for view in views]).to(points)
         nearest = nearest_neighbors(points, centres, 1)[1][:, 0]
-        # Sparse points have no spacing of their own that a scale could be bounded by.
+        # Sparse points have no spacing that could bound a scale.
         config = replace(self.config.disk, bound_spacing=False)
         new = self._initialised(points, centres[nearest], points[:, 0], config, None)
         ids = torch.tensor([view.id for view in views]).to(nearest.device)
@@ -60,7 +60,7 @@ class DiskGrowth:
 
     @torch.no_grad()
     def insert(self, view: MapView, min_confidence: float) -> None:
-        """Disks where the map does not explain a view's depth, by local planes."""
+        """Add disks where the map does not explain a view's depth, on local planes."""
         config, disks = self.config.disk, self.table.disks
         camera = self.depths.views.arrays.cameras.render
         depth, confidence = view.dense.depth, view.dense.confidence
@@ -95,7 +95,7 @@ class DiskGrowth:
         config: DiskConfig,
         seen: Float[Tensor, "n 3"] | None,
     ) -> DiskParameters:
-        """New disks beside those of the map, as the settings have them start."""
+        """New disks at points, initialised by the method of the settings."""
         existing = self.table.disks.position.detach()
         if self.config.ablation.initialisation == "random":
             return random_disks(points, existing, config.opacity, self.table.random.of_torch)

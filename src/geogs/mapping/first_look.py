@@ -34,16 +34,16 @@ _NEAR, _FAR, _RATIO = 3.0, 6.0, 2.5
 # Parallax in degrees of the nearest two cameras at the first distance, of the farthest at the last.
 _WIDEST, _NARROWEST = 25.0, 1.5
 _NEIGHBOURS, _PLANES = 6, 64
-# Images swept at every distance; the others are at the best of these and those next to it.
+# Images swept at every distance; the others only at the best distance and the two next to it.
 _SCOUTS = 3
 # Most images among which distances and neighbours are chosen.
 _CANDIDATES = 200
-# A match counts if the windows are this alike and the next best plane is this much worse.
+# Highest cost of a match that counts, and least margin to the next best plane.
 _MAX_COST, _MIN_MARGIN = 0.3, 1.0
 # Least fraction of pixels that match. Measured: 0.4 to 0.9 where poses are right, below
-# 0.06 with camera-to-world taken for world-to-camera.
+# 0.06 with camera-to-world in place of world-to-camera.
 _LEAST_CLEAR = 0.05
-# Planes at the ends of a range win for whatever lies beyond it.
+# Fraction of the range at each end that is not used: planes there win for all that lies beyond.
 _END = 0.04
 
 SmallImage = tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "mh mw"] | None]
@@ -115,7 +115,7 @@ def _count(found: Found, distance: float) -> int:
 
 
 def _spread(count: int, most: int) -> list[int]:
-    """At most so many numbers below ``count``, evenly spread, first and last among them."""
+    """At most ``most`` numbers below ``count``, evenly spread, first and last among them."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist()
 
 

@@ -25,11 +25,11 @@ from geogs.world.keyframes import Keyframe
 CHECKING_VIEWS = 8
 """Keyframes whose depth checks a new keyframe's depth and whose free space carves around it."""
 SEARCHED_TOGETHER = 32
-"""Keyframes whose images and depths are in memory at once where all are searched anew."""
+"""Keyframes whose images and depths are in memory at once when all are searched again."""
 
 
 class KeyframeDepths:
-    """Searches the depths of some of all ``views``, and lets them check each other."""
+    """Searches the depths of keyframes, and lets them check each other."""
 
     def __init__(
         self,
@@ -47,8 +47,8 @@ class KeyframeDepths:
     def estimate(self, views: Sequence[MapView], progress: Progress = silent) -> None:
         """Search the depths of some views, not too many at once.
 
-        Normals that the depth network gives are left out: as N_f of the map's loss they make
-        facets smoother, and its depths less right (docs/depth-network.md).
+        Normals of the depth network are left out: as N_f of the map's loss they make facets
+        smoother, but depths less accurate (docs/depth-network.md).
         """
 
         def on(done: float) -> None:
@@ -85,7 +85,7 @@ class KeyframeDepths:
         return chosen[:CHECKING_VIEWS]
 
     def keep(self, points: Float[Tensor, "n 3"], views: Sequence[MapView]) -> Bool[Tensor, "n"]:
-        """World points outside the free space of some views."""
+        """Whether world points lie outside the free space of some views."""
         known = [v for v in views if v.has_depth]
         # Read one after the other where they are not in memory.
         return self.engine.keep(points, OnDemand(known, attrgetter("posed")))
@@ -100,13 +100,13 @@ class KeyframeDepths:
         return DepthTask(view.depth_view, neighbours, limits)
 
     def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
-        """The other views from which a depth is best seen, best first."""
+        """The other views that suit a search around a depth, best first."""
         poses, camera = [v.view_pose for v in others], self.views.arrays.cameras.render
         chosen = select_sweep_neighbours(view.view_pose, poses, depth, camera)
         return [others[i] for i in chosen]
 
     def _planar(self, views: Sequence[MapView], depths: list[DenseDepth]) -> list[DenseDepth]:
-        """The depths of views, with those of bare segments on planes if that is asked for."""
+        """The depths of views; with ``bare_planes``, those of bare segments are on planes."""
         if not self.bare_planes:
             return depths
         camera = self.views.arrays.cameras.render
@@ -130,7 +130,7 @@ class KeyframeDepths:
 
 
 def tracked_depth(keyframe: Keyframe) -> float:
-    """Median depth of the cells whose depth the tracker knows fairly well, else of all."""
+    """Median depth of the cells with a fairly certain depth of the tracker, else of all."""
     z = 1 / keyframe.inverse_depth.clamp(min=1e-3)
     known = z / keyframe.confident_information.clamp(min=1e-12).sqrt() < 0.2
     return float(z[known].median() if int(known.sum()) > 8 else z.median())

@@ -18,7 +18,7 @@ from geogs.world.keyframes import Keyframe
 from geogs.world.map import ViewRow
 
 UNKNOWN = 1e3
-"""Relative deviation of a depth that nobody measured."""
+"""Relative standard deviation of an unmeasured depth."""
 
 
 @dataclass(eq=False)
@@ -51,7 +51,7 @@ class MapView:
 
     @property
     def mask(self) -> Bool[Tensor, "h w"] | None:
-        """Pixels of the render size that belong to the scene; none takes all."""
+        """Pixels of the render size that belong to the scene; None for all."""
         return self.arrays.mask(self.id)
 
     @property
@@ -95,12 +95,12 @@ class MapView:
 
     @property
     def dense(self) -> DenseDepth:
-        """The dense depth, which there must be; read from the file if it is not in memory."""
+        """The dense depth, which must exist; read from the file if it is not in memory."""
         return self.arrays.depth(self.id)
 
     @property
     def posed(self) -> PosedDepth:
-        """The dense depth, which there must be, with the view's pose."""
+        """The dense depth, which must exist, with the view's pose."""
         return PosedDepth(self.T_cw.numpy(), self.dense)
 
     @property
@@ -134,7 +134,7 @@ class MapView:
         self.arrays.set_depth(self.id, depth)
 
     def set_exposure(self, exposure: Float[Tensor, "3"]) -> None:
-        """Set its exposure and noise, which were not known, and compensate its photo."""
+        """Set its exposure and noise, unknown until now, and compensate its photo."""
         self.row.exposure = exposure
         loaded = self.arrays.loaded.peek(self.id)
         if loaded is not None:
@@ -142,7 +142,7 @@ class MapView:
 
 
 class KeyframeViews(Mapping[int, MapView]):
-    """The views of a map by keyframe, in the order in which they came."""
+    """The views of a map by keyframe, in the order in which they were added."""
 
     def __init__(self, arrays: ViewArrays) -> None:
         self.arrays = arrays

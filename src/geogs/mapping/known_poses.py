@@ -1,4 +1,4 @@
-"""Where the depths of views with known poses may lie: what there is instead of a tracker."""
+"""Depth ranges of views with known poses, in place of a tracker's depths."""
 
 from collections.abc import Iterable, Sequence
 
@@ -13,10 +13,10 @@ from geogs.mapping.keyframe_views import MapView
 from geogs.world.map import DepthSearch
 
 FEWEST_POINTS = 100
-"""Points of all views that tell where the scene is."""
-# Points of a view's own that say enough about its depths.
+"""Least number of points, over all views, that locate the scene."""
+# Least number of points in a view that determine its range.
 _ENOUGH_POINTS = 50
-# Points that say how far all views see, at most: more say the same.
+# Most points for the ranges of all views; more would not change them.
 _MOST_POINTS = 20_000
 # Points taken from each dense depth.
 _POINTS_PER_VIEW = 2000
@@ -27,9 +27,9 @@ _CONFIDENT = 0.7
 def depth_search(
     view: ViewPose, points: Float64[np.ndarray, "n 3"], camera: Camera, margin: float
 ) -> DepthSearch:
-    """Where a view's depth may lie: where the points do that it sees, widened by ``margin``.
+    """Depth range of a view: that of the points it sees, widened by ``margin``.
 
-    Of all points where it sees few.
+    If it sees few, that of all points in front of it.
     """
     x, y, z = (points @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]).T
     ahead = z > 1e-6 * np.abs(z).max()
@@ -47,7 +47,7 @@ def depth_search(
 def expect_depths(
     views: Iterable[MapView], points: Float64[np.ndarray, "n 3"], camera: Camera
 ) -> None:
-    """Let every view's depth be searched where these points say; its grid counts for nothing."""
+    """Set every view's search range from these points; the depths of its grid are not used."""
     points = points[:: 1 + len(points) // _MOST_POINTS]
     for view in views:
         view.row.search = depth_search(view.view_pose, points, camera, RANGE_MARGIN)

@@ -1,4 +1,4 @@
-"""A map of many keyframes at once, in an order and in groups that suit the time there is for it."""
+"""Mapping of many keyframes at once, in an order and in groups that suit the time budget."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,9 +14,9 @@ from geogs.threads import worker_count
 
 # Most and least keyframes whose depths are searched in one go.
 _AT_ONCE, _FIRST = 16, 4
-# Newness of its rays from which on a keyframe says enough that others do not.
+# Mean newness of its rays above which a keyframe gets a depth.
 _NEWNESS = 0.1
-# Points of the scene for each keyframe by which that is told; of few keyframes so many in all.
+# Scene points per keyframe that measure it; least number of them in all.
 _POINTS_EACH, _POINTS = 4, 1000
 
 
@@ -28,10 +28,10 @@ def map_all(
 ) -> None:
     """Search the depths of observed keyframes, grow the map with them, and train it.
 
-    Keyframes that see hardly anything from elsewhere than others (:func:`covering`) get no depth;
-    others are matched with them. An exception raised by ``progress`` keeps what there is by then.
-    About a fraction ``SEARCHED`` of a time budget, in seconds, is for depths, of keyframes evenly
-    spread over all; those without depth are left out. Depths that exist already stay.
+    Keyframes that add hardly any new views (:func:`covering`) get no depth; they are only matched
+    with. After an exception raised by ``progress`` the result so far stays. About the fraction
+    ``SEARCHED`` of a time budget, in seconds, is for depths, of keyframes evenly spread over all;
+    those without depth are left out. Existing depths stay.
     """
     ids = [i for i in covering(mapper, keyframe_ids) if not mapper.views[i].has_depth]
     until = None
@@ -52,9 +52,9 @@ def map_all(
 
 
 def covering(mapper: Mapper, keyframe_ids: Sequence[int]) -> list[int]:
-    """Those of some observed keyframes that show the scene as all do, in their order.
+    """Keyframes that cover the scene as well as all the given ones, in order.
 
-    Where a camera lingers or comes again, others see the same points along nearly the same rays.
+    Where a camera lingers or returns, others see the same points along nearly the same rays.
     """
     views, camera = [mapper.views[i] for i in keyframe_ids], mapper.cameras.render
     if not views:
@@ -69,9 +69,9 @@ def covering(mapper: Mapper, keyframe_ids: Sequence[int]) -> list[int]:
 
 
 def spread_order(items: Sequence[int]) -> list[int]:
-    """The items in an order whose every beginning is spread evenly over all of them.
+    """Reorder items so that for any n the first n are spread evenly over all of them.
 
-    The first, then the middle one, then those at the quarters: by the reversed bits of their index.
+    The first, then the middle one, then those at the quarters: by the reversed bits of the index.
     """
     bits = max(len(items) - 1, 1).bit_length()
     places = sorted(range(len(items)), key=lambda i: int(f"{i:0{bits}b}"[::-1], 2))
@@ -90,9 +90,9 @@ def search_depths(
     until: float | None = None,
     at_once: int = _AT_ONCE,
 ) -> None:
-    """Search the depths of keyframes in groups of ``at_once``; those that get one are mapped.
+    """Search the depths of keyframes in groups of ``at_once``; those with a depth are mapped.
 
-    An exception raised by ``progress`` keeps the groups before. With ``until``, a time of
+    After an exception raised by ``progress`` finished groups stay. With ``until``, a time of
     ``time.perf_counter``, groups are small, and the rest is left without depth as soon as the next
     one would take longer; the first group is always done.
     """

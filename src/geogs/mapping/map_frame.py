@@ -1,4 +1,4 @@
-"""The frame and unit of a map whose world has given ones."""
+"""Internal frame and unit of a map whose world frame and unit are given."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +19,8 @@ _SAMPLED_CAMERAS = 8
 class MapFrame:
     """Map coordinates are (world - origin) / unit; axes are the same.
 
-    So disks keep their float32 precision, and the renderer its fixed near plane, whatever the
-    origin and the unit of the poses.
+    This keeps the float32 precision of disks, and lets the renderer use a fixed near plane,
+    whatever the origin and the unit of the poses.
     """
 
     origin: Float64[np.ndarray, "3"]

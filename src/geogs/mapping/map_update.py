@@ -1,12 +1,12 @@
 """Moving the map after the trajectory was corrected: blended, coherent (the paper's), per keyframe.
 
-Each disk has an anchor, the keyframe it was made from. The correction of its anchor would carry it
+Each disk has an anchor, the keyframe it was made from. The correction of its anchor would move it
 to a target position (Eq. target_position). Moving every disk to its own target tears surfaces that
 several keyframes share. The coherent update fits one Sim(3) to the targets of all disks whose
 anchors move, the paper's revisited ones (Eq. global_sim3): it tears nothing among them and cannot
 follow a drift. Where only part of the map is revisited and one Sim(3) does not describe how it
-moves, it would tear the part from the rest, and each disk goes with its anchor. The blended one
-moves every disk with all keyframes that see it where it lies
+moves, it would tear the part from the rest, and each disk goes with its anchor. The blended update
+moves every disk with all keyframes on whose depth it lies
 (:mod:`geogs.mapping.similarity_field`).
 """
 
@@ -27,13 +27,13 @@ from geogs.types import PoseCorrection
 Strategy = Literal["blended", "coherent", "per_keyframe"]
 
 MIN_MOTION = 1e-3
-"""An anchor has moved if its disks do by more than this fraction of their distance to it."""
+"""An anchor has moved if its disks move by more than this fraction of their distance to it."""
 MAX_RESIDUAL = 0.5
 """Largest residual of the one Sim(3), as a fraction of the correction, where other disks stay."""
 
 
 def covisible_keyframe(view: MapView, correction: PoseCorrection) -> CovisibleKeyframe:
-    """Depth and pose of a view before a correction that it has taken over."""
+    """Depth and pose of a view before a correction that was applied to it."""
     depth, scale = view.dense.depth, correction.scale.get(view.id, 1.0)
     T_cw = correction.before.get(view.id, view.T_cw)
     return CovisibleKeyframe(
@@ -76,8 +76,8 @@ def plan_update(
     Disks whose anchor is not in the correction follow the corrected keyframe nearest in time.
     ``per_keyframe`` moves each with its anchor, ``coherent`` those whose anchors move by the one
     Sim(3) that fits their targets best (:func:`coherent_similarities`), ``blended`` each with the
-    ``covisible`` keyframes that see it in place (with its anchor where none does), evened out among
-    neighbours; those that the correction does not have count for nothing.
+    ``covisible`` keyframes on whose depth it lies (with its anchor if there is none), smoothed over
+    neighbours; covisible keyframes that are not in the correction are ignored.
     """
     if len(position) == 0:
         return torch.zeros(0, 4, 4, dtype=torch.float64)
@@ -124,9 +124,9 @@ def _revisited(
 ) -> Bool[Tensor, "n"]:
     """Disks whose anchors lie where the correction begins, or later: those that were adjusted.
 
-    All of them where all keyframes were.
-    ``slot`` is an anchor's place among the corrected keyframes. It begins with the first that has
-    moved; where that is the second, with the first of all, which only holds the world in place.
+    All disks if all keyframes were adjusted.
+    ``slot`` is the index of an anchor among the corrected keyframes. The correction begins with the
+    first that has moved; if that is the second, with the very first, which only fixes the frame.
     """
     if correction.of_all:
         return torch.ones_like(slot, dtype=torch.bool)

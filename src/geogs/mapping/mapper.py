@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from geogs.mapping.training.trainer_choice import MapTrainer
 
 CARVE_EVERY = 10
-"""Keyframes between votes of all keyframes around against disks in free space, which take time."""
+"""Keyframes between two votes of all nearby keyframes on disks in free space, which take time."""
 # Most keyframes by which the map follows a correction: neighbours move alike.
 _COVISIBLE = 256
 SEARCHED = 0.4
@@ -50,15 +50,15 @@ SEARCHED = 0.4
 
 
 def never_pause() -> None:
-    """Give way to nobody."""
+    """Do nothing: never give way to other threads."""
 
 
 class Mapper:
     """Grows and trains the map keyframe by keyframe.
 
     ``observe`` takes final keyframes as images to match with; ``map_keyframe`` makes one of them
-    part of the map. Poses are those of the keyframes at any time. Everything is in the tracker's
-    units; settings that are lengths are scaled by the median depth of the first keyframe.
+    part of the map. Poses are always the current ones of the keyframes. Everything is in the
+    tracker's units; settings that are lengths are scaled by the median depth of the first keyframe.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Mapper:
         self.depths.engine.observe(view.depth_view)
 
     def see_anew(self, masks: Mapping[int, Bool[np.ndarray, "h w"] | None]) -> None:
-        """Use the present images of all keyframes, and new masks."""
+        """Use the current images of all keyframes, and new masks."""
         for id, mask in masks.items():
             if mask is not None:
                 self.views.arrays.put_mask(id, mask)
@@ -191,7 +191,7 @@ class Mapper:
             self.keyframes[i].T_cw = T_cw
 
     def correct(self, correction: PoseCorrection) -> None:
-        """Move the map with a global correction that the keyframes have taken over."""
+        """Move the map with a global correction that was applied to the keyframes."""
         views = [v for v in self.views.values() if v.has_depth]
         views = views[:: 1 + len(views) // _COVISIBLE]
         disks = self.table.disks
@@ -206,7 +206,7 @@ class Mapper:
     # --- all keyframes at once -------------------------------------------------------------
 
     def search_depths(self, keyframe_ids: Sequence[int]) -> None:
-        """Depths of some keyframes from their images; they are mapped then."""
+        """Search the depths of some keyframes in their images; they count as mapped then."""
         self.depths.estimate([self.views[i] for i in keyframe_ids])
         self.table.mapped = sorted({*self.table.mapped, *keyframe_ids})
 
@@ -215,9 +215,9 @@ class Mapper:
         self.depths.check(self._searched())
 
     def grow(self, points: Float[Tensor, "n 3"] | None = None) -> None:
-        """Carve the map with all mapped keyframes, and add what their depths show beyond it.
+        """Carve the map with all mapped keyframes, and add disks where their depths show more.
 
-        Where the settings start disks at points, it begins with these instead.
+        If the settings start disks at points, add disks at ``points`` instead.
         """
         views = self._mapped()
         self.partners.choose(views)
@@ -230,7 +230,7 @@ class Mapper:
 
     def refine(self, progress: Progress = silent) -> None:
         """Train over all mapped keyframes, at least one, with the final poses, after searching
-        their depths again if the settings say so."""
+        their depths again if the settings require it."""
         searched, start = self._searched(), SEARCHED if self.config.final_depth else 0.0
         if self.config.final_depth and searched:
             self.depths.estimate(searched, lambda fraction: progress(SEARCHED * fraction))
@@ -258,7 +258,7 @@ class Mapper:
         self.growth.prune(self._mapped())
         self.table.disks.keep(self.table.disks.seen > 0)
 
-    # --- what there is ---------------------------------------------------------------------
+    # --- results ---------------------------------------------------------------------------
 
     @torch.no_grad()
     def renders(
@@ -266,8 +266,8 @@ class Mapper:
     ) -> Sequence[RenderedKeyframe]:
         """The map, or other disks in its frame, rendered from all mapped keyframes, or from some.
 
-        Rendered now, from a snapshot, as disks in a file would be; of a long video most renderings
-        are read from a temporary file when they are asked for.
+        They are rendered now, from a snapshot, as disks in a file would be. For a long video most
+        renderings are read from a temporary file on access.
 
         Raises:
             OutputError: the disk is full, or cannot be written.
@@ -281,14 +281,14 @@ class Mapper:
         return OnDemand(stored, StoredRender.load)
 
     def renderer(self, frame: MapFrame = WORLD) -> MapRenderer:
-        """A renderer of the present map from any pose in the coordinates of a world."""
+        """A renderer of the current map from any pose in the world that ``frame`` relates to it."""
         rules = SurfaceRules.of(self.config)
         return MapRenderer(self.table.disks.snapshot(), frame, self.cameras.render, rules)
 
     def depth_maps(self, of: Sequence[int] | None = None) -> Sequence[RenderedKeyframe]:
         """The dense depths of all mapped keyframes, or of some, weighted by confidence.
 
-        They are not rendered; each is read, as it is then, when it is asked for.
+        They are not rendered; each is read on access, as it is then.
         """
         return OnDemand(self._mapped(of), partial(searched_keyframe, camera=self.cameras.render))
 
@@ -303,7 +303,7 @@ class Mapper:
     def _due(self, keyframe_id: int) -> list[MapView]:
         """The keyframe and its successors whose depths are searched now, to check each other.
 
-        The tracker's own depths are taken anew, those of the window, too.
+        If depths are the tracker's own, those of the window are taken again, too.
         """
         later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
         if self.config.depth.engine == "tracker":

@@ -17,13 +17,13 @@ from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.world.map import MapTable
 
 BEST_PARALLAX_DEG = 8.0
-"""Preferred parallax: smaller ones tell less of depth, at larger ones surfaces look less alike."""
+"""Preferred parallax: smaller ones constrain depth less, larger ones change appearance more."""
 MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 2.0, 25.0
 """Least and largest parallax of partners."""
 CANDIDATES = 128
 """Nearest keyframes among which neighbours and partners are chosen."""
 _STRIDE = 4
-"""Stride over the pixels of a dense depth that are compared, in both directions."""
+"""Stride over the compared pixels of a dense depth, in both directions."""
 _CONFIDENT = 0.3
 """Least confidence of its depth."""
 _DARK, _BRIGHT = 0.02, 0.98
@@ -78,8 +78,8 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
 def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
     """Gain and offset that bring the grey values of a view to those of others, and its noise.
 
-    The others' exposure is compensated already. The dense depth of the view tells where its pixels
-    are in them. Gain 1, offset 0 and the usual noise where there is nothing to compare with.
+    The others' exposure is already compensated. The view's dense depth gives the positions of its
+    pixels in them. Without others: gain 1, offset 0 and the default noise.
     """
     if not others:
         return identity_exposure(view.dense.depth.device)

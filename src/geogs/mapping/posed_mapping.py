@@ -16,7 +16,7 @@ from geogs.mapping.training.full import seconds_per_step
 More = Callable[[Callable[[], int]], None]
 """Adds further images, at most as many as its argument returns when it is called."""
 
-# Steps whose mean time is that of the next ones.
+# Steps from which on their mean time predicts that of further ones.
 _ENOUGH_STEPS = 100
 
 
@@ -49,7 +49,8 @@ class PosedMapping:
     ) -> None:
         """Search the depths of the images; if time allows, again in the ranges of the first result.
 
-        Where time is short, of fewer images: the first ones ``in_order``, else evenly spread ones.
+        If time is short, fewer images are searched: the first ones if ``in_order``, else evenly
+        spread ones.
         """
         search, mapper, budget = self._search, self._mapper, self._budget
         camera = mapper.cameras.working
@@ -102,7 +103,7 @@ class PosedMapping:
         return int(np.clip(done + left / seconds, 1, search.most_steps_per_view * views))
 
     def _try_depths(self) -> tuple[int, float]:
-        """Search some depths to measure the time: their number, and seconds for each.
+        """Search some depths to measure the time; return their number and the seconds for each.
 
         In two groups, as the first one warms up.
         """

@@ -25,25 +25,25 @@ from geogs.world.disks import DiskParameters
 _RADIUS = 3
 """Radius in pixels of the tangent planes that a depth is averaged over."""
 _SLANTED = 0.5
-"""Cosine of the angle between normal and ray (60 degrees) below which spread counts along the
-normal, where nothing around a pixel has a larger one: disks of a road that differ by a centimetre
-in height are hit 20 cm apart 25 m ahead. At a silhouette what is seen at a slant is narrow."""
+"""Cosine of the angle between normal and ray (60 degrees) below which spread is measured along the
+normal, if all pixels around are below it, too: disks of a road that differ by a centimetre in
+height are hit 20 cm apart 25 m ahead. At a silhouette the slanted region is narrow."""
 _AT_ENDS = 0.6
-"""What a depth counts near the end of a surface, where disks reach over it: too little for one
-view to make a surface alone, as it does elsewhere."""
+"""Weight of a depth near the end of a surface, where disks reach over it: too little for one view
+to make a surface alone, as it does elsewhere."""
 _AROUND = 2
-"""Rows and columns that are near."""
+"""Radius of a neighbourhood, in rows and columns."""
 
 
 class SurfaceMaps(NamedTuple):
     """A surface rendered from one pose."""
 
     depth: Float[Tensor, "h w"]
-    """0 where the map is too thin to say."""
+    """0 where the map is too transparent."""
     normal: Float[Tensor, "h w 3"]
     """Camera frame, unit and facing the camera; zero where there is no depth."""
     weight: Float[Tensor, "h w"]
-    """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
+    """Confidence of the depth, in [0, 1]; less where disks spread along the ray."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -51,11 +51,11 @@ class RenderedView(ShortRepr):
     """A map rendered from one pose, as NumPy arrays."""
 
     depth: Float[np.ndarray, "h w"]
-    """z in map units; 0 where the map is too thin to say."""
+    """z in map units; 0 where the map is too transparent."""
     normal: Float[np.ndarray, "h w 3"]
     """Camera frame, unit and facing the camera; zero where there is no depth."""
     weight: Float[np.ndarray, "h w"]
-    """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
+    """Confidence of the depth, in [0, 1]; less where disks spread along the ray."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,16 @@ class MapRenderer:
         camera: Camera | None = None,
         mask: Bool[Tensor, "h w"] | None = None,
     ) -> SurfaceMaps:
-        """What a camera sees inside a mask; that of the keyframes' depth maps if none is given."""
+        """Render the surface inside a mask; ``camera`` defaults to that of the depth maps."""
         disks = DiskParameters.of(self.disks)
         pose = self.frame.pose(T_cw)
         maps = rendered_surface(disks, camera or self.camera, pose, self.rules, mask)
         return maps._replace(depth=maps.depth * self.frame.unit)
 
     def render(self, T_cw: GivenPose, camera: Camera | None = None) -> RenderedView:
-        """What a camera sees from any pose, world to camera, as NumPy arrays.
+        """Render the surface from any pose, world to camera, as NumPy arrays.
 
-        ``camera`` is that of the keyframes' depth maps if none is given. Raises InputError if the
+        ``camera`` defaults to that of the keyframes' depth maps. Raises InputError if the
         pose is no 4x4 matrix of finite numbers.
         """
         maps = self.surface(as_pose(T_cw), camera)
@@ -118,7 +118,7 @@ def rendered_surface(
     rules: SurfaceRules,
     mask: Bool[Tensor, "h w"] | None,
 ) -> SurfaceMaps:
-    """Disks seen from a pose inside a mask, with the weight of each depth for fusion."""
+    """Render disks from a pose inside a mask, with the weight of each depth for fusion."""
     output = render(disks, camera, T_cw)
     depth = output.shown_depth(rules.min_alpha)
     if mask is not None:

@@ -1,8 +1,8 @@
 """A similarity for every disk, smooth over each surface: the blended map update.
 
 A correction gives each keyframe a similarity by which its surface moves. A disk moves with all
-keyframes on whose depth it lies: they trained it, not only the one that made it. Of a surface that
-a drifting loop has doubled, each layer lies on the depths of its own visit and moves with these.
+keyframes on whose depth it lies: they trained it, not only the one that made it. Where a drifting
+loop has doubled a surface, each layer lies on the depths of its own visit and moves with these.
 Then the similarities are smoothed between neighbours, but not across layers that have to part.
 """
 
@@ -27,7 +27,7 @@ _BORDER = 8.0
 _NEIGHBOURS = 32
 _ROUNDS = 4
 _SPREAD = 1.5
-"""Width of the smoothing, in distances to the middle one of the neighbours."""
+"""Width of the smoothing, in units of the median distance to the neighbours."""
 _PARTING = 0.2
 """Difference of the displacements of neighbours of different layers, in that width."""
 
@@ -44,7 +44,7 @@ class CovisibleKeyframe:
     depth: Float[Tensor, "h w"]
     """z in map units, before the correction."""
     confidence: Float[Tensor, "h w"]
-    """In [0, 1]."""
+    """Confidence of the depth, in [0, 1]."""
 
 
 def blended_similarities(
@@ -56,9 +56,9 @@ def blended_similarities(
 ) -> Float[Tensor, "n 4 4"]:
     """World similarities of disks at ``x``, float64.
 
-    ``own`` is the correction of the keyframe that made each; every covisible keyframe, one at a
-    time, comes with the place of its own among the ``similarities``. Blends are means in the Lie
-    algebra of Sim(3) of what remains after ``reference``, which should be near all of them; they do
+    ``own`` is the correction of the keyframe that made each disk. Every covisible keyframe comes
+    with the index of its correction in ``similarities``. Blends are means in the Lie algebra of
+    Sim(3) of the corrections relative to ``reference``, which should be near all of them; they do
     not depend on the origin of the world.
     """
     back = sim3_inverse(reference)
@@ -74,7 +74,7 @@ def blended_similarities(
 
 
 def agreement(x: Float[Tensor, "n 3"], keyframe: CovisibleKeyframe) -> Float[Tensor, "n"]:
-    """In [0, 1]: the keyframe's confidence that there is a surface at each point."""
+    """The keyframe's confidence, in [0, 1], that there is a surface at each point."""
     camera = keyframe.camera
     T = keyframe.T_cw.to(x)
     y = x @ T[:3, :3].T + T[:3, 3]
@@ -92,7 +92,7 @@ def agreement(x: Float[Tensor, "n 3"], keyframe: CovisibleKeyframe) -> Float[Ten
 def smoothed(
     x: Float[Tensor, "n 3"], moved: Float[Tensor, "n 3"], tangent: Float[Tensor, "n 7"]
 ) -> Float[Tensor, "n 7"]:
-    """Tangents at points ``x``, each a mean over near points that go about the same way.
+    """Smooth tangents at points ``x``: each is a mean over near points that move alike.
 
     A bilateral filter: its weights fall with the distance, and with the distance between where both
     tangents take the point ``moved`` (to first order), so layers that have to part do.
@@ -113,5 +113,5 @@ def smoothed(
 
 
 def _displacement(xi: Float[Tensor, "n 7"], x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """How small tangents displace points, to first order."""
+    """Displacement of points by small tangents, to first order."""
     return xi[:, :3] + torch.linalg.cross(xi[:, 3:6], x) + xi[:, 6:] * x

@@ -20,16 +20,16 @@ class StoredRender:
     T_cw: Float[Tensor, "4 4"]
     depth: Archived
     normal: Archived
-    """In half precision."""
+    """Normals, in half precision."""
     weight: Archived
     image: Archived
     timestamp: float
     mask: Bool[Tensor, "h w"] | None
     device: torch.device
-    """Where the maps were rendered."""
+    """Device on which the maps were rendered."""
 
     def load(self) -> RenderedKeyframe:
-        """The rendering with all that belongs to it in memory."""
+        """Read the rendering into memory."""
         depth, normal, weight = (
             torch.from_numpy(maps.load()).to(self.device).float()
             for maps in (self.depth, self.normal, self.weight)

@@ -7,7 +7,7 @@ import numpy as np
 
 from geogs.config import SearchConfig
 
-# Time to check depths and grow disks, over that of one search of the depths.
+# Ratio of the time to check depths and grow disks to that of one search of the depths.
 _GROWING = 0.6
 
 # Images to read for each that gets a depth, up to a total.
@@ -25,24 +25,24 @@ class ViewCost:
     search: float
     """To search its depth once."""
     output: float
-    """In the mesh and the files."""
+    """To put it into the mesh and the files."""
 
 
 def rounds(search: SearchConfig) -> float:
-    """Time before the training, with checks and growth, over that of one search of the depths."""
+    """Ratio of the time before the training, with checks and growth, to that of one search."""
     return _GROWING + (2.0 if search.repeat else 1.0)
 
 
 def affordable_views(
     seconds: float, cost: ViewCost, search: SearchConfig, searched: int = 0, read: int = 0
 ) -> int:
-    """Number of images whose time before the training is a given fraction of the time.
+    """Number of images that can be prepared in the fraction ``search.depth_ratio`` of the time.
 
-    It is ``search.depth_ratio`` of the time less that for their mesh and files.
+    That is the time left without that for their mesh and files.
 
     Args:
-        seconds: time left, less that for mesh and files however many images there are.
-        cost: of an image.
+        seconds: time left, less the fixed time for mesh and files.
+        cost: seconds for an image.
         search: whether depths are searched twice, and the fraction.
         searched: images whose depth has been searched once by now.
         read: images that have been read by now.
@@ -56,9 +56,9 @@ def helpers(views: int, seconds: float, cost: ViewCost) -> int:
     """Number of images to read beyond those that get a depth, to match these with.
 
     Args:
-        views: that get a depth.
-        seconds: left.
-        cost: of an image.
+        views: number of images that get a depth.
+        seconds: time left.
+        cost: seconds for an image.
     """
     few = max(min(_HELPERS * views, _FEW) - views, 0)
     return min(few, max(int(_HELP * seconds / max(cost.reading, 1e-9)), 0))
@@ -69,12 +69,12 @@ class OutputCost:
     """Seconds for the mesh and the files."""
 
     once: float
-    """For any number of images."""
+    """Fixed part, whatever the number of images."""
     a_view: float
     """For each image of the map."""
 
     def of(self, views: int) -> float:
-        """Seconds for so many images."""
+        """Seconds for ``views`` images."""
         return self.once + views * self.a_view
 
 
@@ -106,7 +106,7 @@ class TimeBudget:
         self._read.append(time.perf_counter())
 
     def count_spent(self, seconds: float) -> None:
-        """Take off seconds spent before."""
+        """Subtract seconds spent before."""
         if self._deadline is not None:
             self._deadline -= seconds
 

@@ -39,7 +39,7 @@ class MapCameras:
 
     @staticmethod
     def of(camera: Camera, config: MappingConfig) -> "MapCameras":
-        """The sizes that the settings ask for, none above the working image."""
+        """The sizes of the settings, none above the working image."""
         working = max(camera.width, camera.height)
         long_edge = min(config.render_long_edge, working)
         photo = min(round(config.photo_scale * long_edge), working)
@@ -52,16 +52,16 @@ class LoadedView:
 
     image: UInt8[np.ndarray, "wh ww 3"]
     photo: PhotoView
-    """With the exposure compensated, on the map's device; its pose may be outdated."""
+    """Image with compensated exposure, on the map's device; its pose may be outdated."""
     normal: Float[Tensor, "h w 3"] | None
     """A prior's normals at the render size, on the map's device."""
     depth: DenseDepth | None = None
     scale: float = 1.0
-    """Scale of the keyframe when the depth was as it is here."""
+    """Scale of the keyframe to which ``depth`` belongs."""
     constants: ViewConstants | None = None
     rendered_depth: Float[Tensor, "h w"] | None = None
     matched: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "fh fw"]] | None = None
-    """Grey images of the :class:`DepthView`, once it was asked for."""
+    """Grey images of the :class:`DepthView`, once they were needed."""
     is_depth_written: bool = True
     is_render_written: bool = True
 
@@ -113,7 +113,7 @@ class ViewArrays:
         self.table.resident = [id for id, _ in loaded]
 
     def forget_images(self) -> None:
-        """Discard what was made of the images of keyframes, which have been replaced."""
+        """Discard data made from the keyframes' images, which have been replaced."""
         self.settle()
         self._ahead.begin([])
         self.loaded = LruCache(self.loaded.limit, self._write)
@@ -126,7 +126,7 @@ class ViewArrays:
         return self._at_scale(id, loaded)
 
     def mask(self, id: int) -> Bool[Tensor, "h w"] | None:
-        """Pixels of the render size that belong to the scene; none takes all."""
+        """Pixels of the render size that belong to the scene; None for all."""
         arrays = self.table.arrays
         if not arrays.has("mask", id):
             return None
@@ -135,7 +135,7 @@ class ViewArrays:
         )
 
     def depth(self, id: int) -> DenseDepth:
-        """The dense depth, which there must be."""
+        """The dense depth, which must exist."""
         loaded = self.loaded.peek(id)
         if loaded is None:
             return self._read_depth(id, self.keyframes[id].scale)
@@ -172,7 +172,7 @@ class ViewArrays:
     # --- from and to the file --------------------------------------------------------------
 
     def _load(self, id: int, as_written: bool = False) -> LoadedView:
-        """The large parts of a view; its depth at the keyframe's scale, or as it was written."""
+        """Read a view; its depth at the keyframe's scale, or as it was written."""
         cameras, loss = self.cameras, self.loss
         keyframe, row = self.keyframes[id], self.table.views[id]
         image = keyframe.image
@@ -201,7 +201,7 @@ class ViewArrays:
         return loaded
 
     def _basis(self, id: int) -> Basis:
-        """The objects that are replaced when what a view is loaded from changes."""
+        """The objects that a view is loaded from; a change replaces them."""
         keyframe, row = self.keyframes[id], self.table.views[id]
         rendered = self.table.arrays.pieces.get("rendered depth", {}).get(id)
         return keyframe, keyframe.scale, row.exposure, row.depth, rendered
@@ -220,7 +220,7 @@ class ViewArrays:
             arrays.recent("depth there", DEPTHS_ON_GPU).put(id, (row.depth, depth))
 
     def _read_depth(self, id: int, scale: float) -> DenseDepth:
-        """The depth that was written, at a scale of its keyframe."""
+        """Read the written depth at a scale of its keyframe."""
         arrays, written = self.table.arrays, self.table.views[id].depth
         assert written is not None, f"keyframe {id} has no depth yet"
         if self.device.type == "cuda":
@@ -256,7 +256,7 @@ class ViewArrays:
 
 
 def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> SearchedDepth:
-    """Write the depth of a keyframe that has a scale now.
+    """Write the depth of a keyframe whose current scale is ``scale``.
 
     Raises:
         OutputError: the disk is full, or cannot be written.
@@ -264,7 +264,7 @@ def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> S
     maps = depth.arrays()
     arrays.put("depth", id, maps.depth)
     arrays.put("confidence", id, maps.confidence)
-    # Nobody measures with the normals.
+    # Half precision suffices: the normals are not measured with.
     normal = None if depth.normal is None else depth.normal.half()
     for name, values in (("depth normal", normal), ("sky", depth.sky)):
         if values is None:
@@ -277,7 +277,7 @@ def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> S
 def get_depth(
     arrays: ArrayTable, id: int, stored: SearchedDepth, scale: float, device: torch.device
 ) -> DenseDepth:
-    """Read the depth of a keyframe at another scale of it."""
+    """Read the depth of a keyframe, converted to another scale of it."""
     depth, confidence = (torch.from_numpy(arrays.load(n, id)) for n in ("depth", "confidence"))
     if scale != stored.scale:
         depth = depth * (scale / stored.scale)
@@ -290,7 +290,7 @@ def get_depth(
 
 
 def confident_jumps(depth: DenseDepth) -> DepthJumps:
-    """Jumps between depths that are known fairly well."""
+    """Jumps between fairly certain depths."""
     return depth_jumps(torch.where(depth.confidence >= CONFIDENT, depth.depth, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""A mesh in boxes of space, each worked on alone, and stitched to what one volume would give.
+"""Extraction of a mesh in boxes of space, stitched to the mesh that one volume would give.
 
 All boxes sample the same grid of voxels, and each has one layer of its neighbours' blocks: where
 two boxes meet they compute the same distances, so the same vertices on the same voxel edges.
@@ -43,11 +43,11 @@ def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
 
 
 def boxes_of(blocks: Int[np.ndarray, "k 3"], most: int) -> list[BlockBox]:
-    """Boxes that have every block once, each with at most so many or else as small as can be.
+    """Divide blocks into boxes of at most ``most`` blocks, or else as small as possible.
 
     Args:
         blocks: coordinates, each once.
-        most: blocks in a box. One of the chunks that surfaces are extracted in is not divided.
+        most: blocks in a box. A chunk, in which surfaces are extracted, is not divided.
     """
     chunks, counts = np.unique(np.floor_divide(blocks, CHUNK), axis=0, return_counts=True)
     return _divided(chunks, counts, most) if len(chunks) else []
@@ -72,7 +72,7 @@ def _divided(
 
 
 def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> bool:
-    """Whether a view may change a voxel of a box; those that may not need not be fused there."""
+    """Whether a view may change a voxel of a box; other views need not be fused there."""
     side = plan.voxel * BLOCK
     low, high = (np.array(c, dtype=np.float64) for c in (box.low, box.high))
     middle, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
@@ -92,8 +92,7 @@ def mesh_block(
 ) -> MeshBlock:
     """Fuse the views in one box of space and extract its surface.
 
-    ``views`` are those that see the box, in the order in which all would be fused; others change
-    nothing.
+    ``views`` are those that see the box, in the order of fusion; others change nothing.
     """
     tsdf = SparseTsdf(plan.voxel, plan.truncation, device, box=box, contraction=plan.contraction)
     for view in views:
@@ -113,7 +112,7 @@ def stitched_blocks(blocks: Sequence[MeshBlock], plan: VolumePlan, config: MeshC
 
 
 def expanded_mesh(mesh: Mesh, contraction: Contraction) -> Mesh:
-    """The mesh of the world that one of contracted space stands for, with its colours."""
+    """Transform a mesh of contracted space to the world, with its colours."""
     if not contraction:
         return mesh
     vertices = contraction.expanded(torch.from_numpy(mesh.vertices)).numpy()
@@ -121,7 +120,7 @@ def expanded_mesh(mesh: Mesh, contraction: Contraction) -> Mesh:
 
 
 def near(mesh: Mesh, box: BlockBox, plan: VolumePlan) -> Bool[np.ndarray, "n"]:
-    """Which vertices of a mesh in contracted space lie in a box."""
+    """Mask of the vertices of a mesh in contracted space that lie in a box."""
     side = plan.voxel * BLOCK
     block = np.floor_divide(mesh.vertices.astype(np.float64), side)
     return np.asarray(((block >= box.low) & (block < box.high)).all(axis=1))

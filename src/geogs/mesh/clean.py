@@ -12,17 +12,16 @@ from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import Mesh
 
 LEAST_OF_LARGEST = 2e-4
-"""Parts with fewer faces than this fraction of the largest part's are removed: specks. Of
-a road with its fronts, one part, a trunk or a sign is less than a thousandth."""
+"""Parts with fewer faces than this fraction of the largest part's are removed: specks. A trunk or
+a sign has less than a thousandth of the faces of a road with its fronts, which are one part."""
 CLOSED_HOLES = 8
-"""Holes with so many edges or fewer are closed, unless somebody looked through them."""
+"""Most edges of a hole that is closed, unless a ray crosses it."""
 
 
 def cleaned(
     mesh: TensorMesh, config: MeshConfig, is_free: IsFree
 ) -> tuple[TensorMesh, Float[Tensor, "n 3"]]:
-    """Without what is no surface, and with small holes closed where nobody looked through them;
-    the mesh and its normals.
+    """Remove specks and close small holes that no ray crosses; return the mesh and its normals.
 
     Raises InputError if no surface is left.
     """
@@ -62,8 +61,8 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
 
 
 def without_degenerate_faces(mesh: TensorMesh) -> TensorMesh:
-    """Without faces that repeat a vertex or whose squared area is below 1e-12 of the
-    squared mean edge length squared, and without the vertices this leaves unused."""
+    """Remove faces that repeat a vertex or whose squared area is below 1e-12 of the
+    squared mean edge length squared, and the vertices this leaves unused."""
     return mesh.kept(_have_areas(mesh)) if len(mesh.faces) else mesh
 
 
@@ -82,8 +81,8 @@ def large_components(
 ) -> TensorMesh:
     """Connected parts that are large enough; faces connect by a shared vertex.
 
-    A part stays if it has at least ``min_faces`` faces and at least ``min_fraction`` of the faces
-    of the largest; of those the ``max_components`` largest, all if none is given.
+    A part stays if it has at least ``min_faces`` faces, at least ``min_fraction`` of the faces of
+    the largest, and is among the ``max_components`` largest (None for all).
     """
     if not len(mesh.faces):
         return mesh
@@ -97,10 +96,10 @@ def large_components(
 
 
 def vertex_components(mesh: TensorMesh) -> Int[Tensor, "n"]:
-    """The lowest vertex that each is connected with, found on any device.
+    """Label each vertex with the lowest vertex of its connected part, on any device.
 
-    All vertices name a lower one, at first themselves. Those named by a face's corners learn the
-    lowest of these, then every vertex names what the one that it names does, until nothing changes.
+    Labels begin as the vertices themselves. The vertices that label a face's corners take the
+    lowest of these labels, then labels are followed to their own labels, until nothing changes.
     """
     label = torch.arange(len(mesh.vertices), device=mesh.faces.device)
     while True:
@@ -125,7 +124,7 @@ def components_on_host(mesh: TensorMesh) -> Int[Tensor, "n"]:
 
 
 def border_edges(mesh: TensorMesh) -> Int[Tensor, "e 2"]:
-    """Edges (start, end) of faces that no face has in the other direction, in no order."""
+    """Edges (start, end) of faces that no face has in the other direction, unordered."""
     start, end, count = mesh.faces, mesh.faces.roll(-1, 1), len(mesh.vertices)
     keys = 2 * (torch.minimum(start, end) * count + torch.maximum(start, end)) + (start > end)
     keys = keys.flatten().sort().values.unique_consecutive()
@@ -142,11 +141,11 @@ def border_edges(mesh: TensorMesh) -> Int[Tensor, "e 2"]:
 def with_closed_holes(
     mesh: TensorMesh, most_edges: int, is_free: IsFree
 ) -> tuple[TensorMesh, Float[Tensor, "n 3"]]:
-    """The mesh and its normals, holes with ``most_edges`` or fewer edges closed by a fan around
-    their middle.
+    """Close holes with ``most_edges`` or fewer edges by a fan around their middle; return the mesh
+    and its normals.
 
-    A hole stays open where its middle is free, or where the fan would fold over: such an edge is
-    one of the surface, no gap in it.
+    A hole stays open if its middle is free, or if the fan would fold over: such a border is a real
+    end of the surface, not a gap.
     """
     vertices, normals, device = mesh.vertices, mesh.normals(), mesh.faces.device
 

@@ -16,9 +16,9 @@ from geogs.threads import on_one_torch_thread, thread_map
 
 _GREY = 128
 SLACK = 0.02
-"""Part of the depth by which a vertex may be off what a view shows, beside the tolerance."""
+"""Fraction of the depth by which a vertex may be off a view's depth, besides the tolerance."""
 LEAST_COSINE = 0.05
-"""Cosine of the viewing angle from which on a view sees a face's front."""
+"""Cosine of the viewing angle above which a view sees a face's front."""
 _SPAN = 32768
 """Vertices that a thread of the CPU takes at a time."""
 
@@ -29,7 +29,7 @@ def colour_mesh(
     views: Sequence[DepthMapView],
     tolerance: float,
 ) -> Mesh:
-    """Give each vertex the mean colour of the images that see it, as :func:`seen_colours` says.
+    """Give each vertex the mean colour of the images that see it, by :func:`seen_colours`.
 
     A vertex that no view sees takes the colour of the nearest one that is seen, grey if there is
     none. Computed on the device of the first depth map.
@@ -51,7 +51,7 @@ def seen_colours(
     """Mean colours (0 to 255) of vertices in the images that see them, and which are seen.
 
     A view sees a vertex that projects into the image onto its depth map within ``tolerance``
-    (map units, plus 2 % of the depth) and turns its front to the camera. Views count by
+    (map units, plus 2 % of the depth) and turns its front to the camera. Views are weighted by
     (cosine of the viewing angle / depth)^2: near and frontal ones decide.
     """
     total = torch.zeros_like(vertices)
@@ -113,7 +113,7 @@ class _SeenImage:
     camera: Camera
     T_cw: Float[Tensor, "4 4"]
     depth: Float[Tensor, "h w"]
-    """Infinite where nothing is known."""
+    """Depth; infinite where unknown."""
     image: UInt8[np.ndarray, "ih iw 3"]
     tolerance: float
 
@@ -160,7 +160,7 @@ def _sample(
 def filled(
     vertices: Float[Tensor, "n 3"], mean: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
 ) -> UInt8[Tensor, "n 3"]:
-    """Colours with those of vertices that no view sees: as the nearest that one does."""
+    """Colours as bytes; a vertex that no view sees takes that of the nearest seen one."""
     colours = (mean + 0.5).clamp(0, 255).to(torch.uint8)
     if bool(seen.all()):
         return colours

@@ -10,11 +10,11 @@ ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 def add_colours(
     first, last, vertices, normals, T, lens, depth, image, tolerance, slack, least, total, weight
 ):
-    """Add what a view says of the vertices ``first`` to ``last``: weighted colours to ``total``
-    (n, 3), and their weights to ``weight`` (n).
+    """Add a view's weighted colours of the vertices ``first`` to ``last`` to ``total`` (n, 3), and
+    their weights to ``weight`` (n).
 
     It sees those whose z lies within ``tolerance`` + ``slack`` z of its ``depth`` (h, w; infinite
-    where nothing is known) and whose normal has a cosine of more than ``least`` to the ray. ``T``
+    where unknown) and whose normal has a cosine of more than ``least`` to the ray. ``T``
     (3, 4) world to camera; ``lens`` fx, fy, cx, cy of the depth; ``image`` (ih, iw, 3) bytes.
     """
     height, width = depth.shape

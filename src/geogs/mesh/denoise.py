@@ -1,4 +1,4 @@
-"""Facets turned to their neighbours' normals, never across an edge."""
+"""Smoothing of facets towards their neighbours' normals, never across an edge."""
 
 import torch
 from jaxtyping import Float, Int
@@ -8,11 +8,11 @@ from torch.nn.functional import normalize
 from geogs.mesh.tensor_mesh import vertex_sums
 
 NORMAL_DEVIATION = 0.2
-"""Standard deviation of the length between unit normals (11 degrees) that are of one surface."""
+"""Standard deviation of the distance between unit normals of one surface (11 degrees)."""
 _NORMAL_ROUNDS = 10
-"""Means over neighbours: what is waved over some ten facets is smoothed."""
+"""Number of means over neighbours: waves over about ten facets are smoothed."""
 _VERTEX_ROUNDS = 5
-"""Steps by which vertices follow the normals."""
+"""Number of steps by which vertices follow the normals."""
 
 
 def denoised(
@@ -21,10 +21,10 @@ def denoised(
     """Vertices of the same faces, moved by at most ``reach`` (map units), with less noisy normals.
 
     Each facet's normal becomes the mean of its own and of those beyond its three edges, weighted by
-    area and by how alike they are; then vertices move along the normals of their facets towards
-    where these are planar. What the facets around a vertex moved in common is taken back, so that
-    what is round does not shrink, and vertices of a facet that would be folded over stay. Edges
-    where other than two faces meet let nothing through. float64; of a finite mesh finite.
+    area and by similarity; then vertices move along the normals of their facets towards their
+    planes. The common motion of the facets around a vertex is undone, so round shapes do not
+    shrink, and vertices of a facet that would be folded over stay. Edges where other than two faces
+    meet are not crossed. float64; finite if the mesh is.
 
     Bilateral normal filtering (Zheng et al. 2011) with the moves of Sun et al. (2007), which are
     weighted by area here.
@@ -49,7 +49,7 @@ def denoised(
 
 
 def faces_beyond(faces: Int[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
-    """The face across the edge from each corner to the next; itself where not just one other is."""
+    """The face across the edge from each corner to the next; itself unless there is just one."""
     low, high = torch.stack([faces, faces.roll(-1, 1)]).flatten(1).sort(0).values
     _, edge = torch.unique(low * (high.max() + 1) + high, return_inverse=True)
     order = torch.argsort(edge, stable=True)
@@ -68,8 +68,8 @@ def _unfolded(
     normal: Float[Tensor, "m 3"],
     upright: Float[Tensor, "m"],
 ) -> Float[Tensor, "n 3"]:
-    """The vertices, those of facets whose cosine to their normal fell below ``upright`` at their
-    start; as that may turn the facets around, until there is none."""
+    """Move the vertices of facets whose cosine to their normal fell below ``upright`` back to their
+    start; repeated until there is none, as this may turn the facets around."""
     while True:
         moves = (moved != start).any(1)[faces].any(1)
         folded = moves & ((_facets(moved, faces)[0] * normal).sum(1) < upright)
@@ -82,7 +82,7 @@ def _unfolded(
 def _facets(
     vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 1"]]:
-    """Unit normals, zero of a facet without an area; twice the areas."""
+    """Unit normals, zero for a facet without an area; twice the areas."""
     a, b, c = vertices[faces].unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     return normalize(normal, dim=1, eps=1e-300), normal.norm(dim=1, keepdim=True)
@@ -104,7 +104,7 @@ def _plane_offsets(
     normal: Float[Tensor, "m 3"],
     area: Float[Tensor, "m 1"],
 ) -> Float[Tensor, "n 3"]:
-    """Sum over each vertex's facets of what is missing to their planes, times their areas."""
+    """Sum over each vertex's facets of its offsets to their planes, times their areas."""
     centre = vertices[faces].mean(1)
     total = torch.zeros_like(vertices)
     for corner in faces.unbind(1):

@@ -29,42 +29,42 @@ _log = logging.getLogger(__name__)
 _SAMPLED_VIEWS = 40
 _SAMPLED_POINTS = 400_000
 _MOST_OUT_OF_REACH = 0.05
-"""Part of the surface that may lie beyond the volume, as stray points do."""
+"""Fraction of the surface that may lie beyond the volume, as stray points do."""
 _CROWDED = 0.1
-"""Part of the memory limit from which on, by a sample of the pixels, the blocks of all pixels are
-counted: of scattered surface, as outdoors, there are several times as many."""
+"""Fraction of the memory limit, estimated from a sample of the pixels, above which the blocks of
+all pixels are counted: a scattered surface, as outdoors, has several times as many."""
 _NEAR = 0.1
-"""Part of the pixels that show what is nearest."""
+"""Fraction of the pixels that count as the nearest."""
 _COARSEST = 4.0
-"""Largest voxel over the footprint of those pixels, where there is room for smaller ones: behind
-what is near, a background fills most of the image."""
+"""Largest ratio of the voxel to the footprint of those pixels, if there is room for smaller ones: a
+background may fill most of the image behind near surfaces."""
 _AROUND = 0.95
 """Quantile of the distances of cameras and of surface from the middle."""
 _FAR = 4.0
-"""Distance of the surface, over the radius of the scene around the cameras, from which on there is
-a background, which is contracted."""
+"""Ratio of the surface's distance to the radius of the scene around the cameras above which there
+is a background, which is contracted."""
 _OVERRUN = 1.5
-"""Times the memory limit that a volume may take, where the plan is a sample's."""
+"""Factor on the memory limit that a volume may take, as the plan may be from a sample."""
 _COARSER = 1.5
 """Growth of the voxels from one trial to the next."""
 _FACES_PER_SQUARE = 2.4
-"""Marching cubes makes about so many triangles per voxel face of surface."""
+"""Approximate number of triangles of marching cubes per voxel face of surface."""
 
 
 @dataclass(frozen=True, slots=True)
 class VolumePlan:
-    """How a scene is going to be fused, chosen from its depth maps."""
+    """Plan of a scene's fusion, chosen from its depth maps."""
 
     voxel: float
-    """Map units, where space is not contracted."""
+    """Side of a voxel, map units where space is not contracted."""
     truncation: float
-    """Voxels."""
+    """Truncation distance, voxels."""
     max_depth: float
     """Map units; pixels farther away are left out."""
     blocks: int
-    """Estimated number."""
+    """Estimated number of blocks."""
     triangles: int
-    """Estimated number, before those that the surface does not need are merged."""
+    """Estimated number of triangles before those that the surface does not need are merged."""
     contraction: Contraction = UNCONTRACTED
     """Contraction of the space in which the voxels are a grid."""
 
@@ -78,11 +78,10 @@ class VolumePlan:
 def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
     """Choose voxel size and depth range from the depth maps, before anything is allocated.
 
-    The voxel is the footprint of a pixel at the median depth, smaller where what is near is much
-    nearer than that, larger if the triangle budget or the memory limit demand it. A background
-    that lies far beyond where the cameras were and what is around them is contracted. The depth
-    range is twice the 95 % quantile, so that a few stray far pixels do not blow up the volume.
-    Looks at 40 views at most.
+    The voxel is the footprint of a pixel at the median depth, smaller if near surfaces are much
+    nearer than that, larger if the triangle budget or the memory limit demand it. A background far
+    beyond the cameras and their surroundings is contracted. The depth range is twice the 95 %
+    quantile, so that a few stray far pixels do not blow up the volume. At most 40 views are used.
 
     Raises InputError if no pixel has a depth, or a voxel size is given that does not fit into the
     memory limit or whose volume does not reach as far as the scene.
@@ -110,7 +109,7 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
 
 
 def _blocks_of_given_voxel(points: Float[Tensor, "n 3"], voxel: float, config: MeshConfig) -> int:
-    """Blocks around a surface; InputError where they are too many or do not reach far enough."""
+    """Blocks around a surface; InputError if they are too many or do not reach far enough."""
     reach = LIMIT * voxel
     if float((points.abs() > reach).any(1).double().mean()) > _MOST_OUT_OF_REACH:
         raise InputError(
@@ -138,14 +137,13 @@ def extract_mesh(
     config: MeshConfig | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Mesh:
-    """Fuse depth maps; their surface, cleaned, coloured from the images, decimated, smoothed.
+    """Fuse depth maps; return their surface cleaned, coloured by images, decimated and smoothed.
 
-    ``views`` is gone through up to four times (plan, count, fuse, colour) in order, so a lazy
-    sequence may render on demand. Where a sample of the pixels says that the volume may come near
-    its limit, all are counted, and voxels are as large as it takes; should it outgrow the limit by
-    half it is fused anew with larger ones. The work is done on the device of the first depth map.
-    ``progress`` is called with the stage ("fuse", "colour", "merge"), what is done of it and all
-    there is to do.
+    ``views`` is iterated up to four times (plan, count, fuse, colour) in order, so a lazy sequence
+    may render on demand. If a sample of the pixels predicts a volume near its limit, all are
+    counted, and voxels are enlarged until they fit; if it exceeds the limit by half it is fused
+    again with larger ones. The work is done on the device of the first depth map. ``progress`` is
+    called with the stage ("fuse", "colour", "merge"), the finished steps of it and their total.
 
     Raises InputError if there are no views, no valid depth or no surface.
     """
@@ -166,7 +164,7 @@ def extract_mesh(
         plan = replace(plan, voxel=_COARSER * plan.voxel)
         _log.info("too large: voxel %.4g", plan.voxel)
     found, is_free = _level_set(tsdf, config)
-    del tsdf  # what takes most of the memory
+    del tsdf  # takes most of the memory
     clean, normals = cleaned(found, config, is_free)
     surface = _Surface(clean.vertices, clean.faces.to(torch.int32), normals)
     seen = None
@@ -198,23 +196,23 @@ class _Surface:
 
     vertices: Float[Tensor, "n 3"]
     faces: Int[Tensor, "m 3"]
-    """int32."""
+    """Vertices of each face, int32."""
     normals: Float[Tensor, "n 3"]
 
     def expanded(self, contraction: Contraction) -> "_Surface":
-        """The surface of the world that one of contracted space stands for."""
+        """The surface transformed from contracted space to the world."""
         if not contraction:
             return self
         return _Surface.of(contraction.expanded(self.vertices), self.faces)
 
     @staticmethod
     def of(vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> "_Surface":
-        """With the normals of its faces."""
+        """Make a surface with the normals of its faces."""
         return _Surface(vertices, faces, TensorMesh(vertices, faces.long()).normals())
 
 
 def _level_set(tsdf: SparseTsdf, config: MeshConfig) -> tuple[TensorMesh, FreeSpace]:
-    """The surface in a volume, and where nothing is."""
+    """The surface in a volume, and its free space."""
     extract = extract_surface if tsdf.device.type == "cpu" else device_surface
     return extract(tsdf, config.min_weight), FreeSpace.of(tsdf, config.min_weight)
 
@@ -222,10 +220,10 @@ def _level_set(tsdf: SparseTsdf, config: MeshConfig) -> tuple[TensorMesh, FreeSp
 def _merged_mesh(
     surface: _Surface, seen: tuple[Tensor, Tensor] | None, config: MeshConfig, plan: VolumePlan
 ) -> Mesh:
-    """A surface of contracted space, decimated and smoothed there, in the world and on the host,
-    with the colours of those of its vertices that were seen.
+    """Decimate and smooth a surface in contracted space; return it in the world and on the host,
+    with the colours of the vertices that were seen.
 
-    Others take theirs only now, when there are few.
+    Unseen vertices take their colours only now, when there are few.
     """
     few = merged(surface.vertices, surface.faces, config.detail * plan.voxel)
     if few is not None:
@@ -264,7 +262,7 @@ def fuse(
 
 
 def integrate(tsdf: SparseTsdf, view: DepthMapView, plan: VolumePlan) -> None:
-    """Fuse a view into a volume, without what is farther away than planned."""
+    """Fuse a view into a volume, without pixels beyond the planned depth."""
     weight = torch.where(view.depth <= plan.max_depth, view.weight, 0.0)
     tsdf.integrate(view.depth, weight, view.camera, view.T_cw)
 
@@ -272,11 +270,11 @@ def integrate(tsdf: SparseTsdf, view: DepthMapView, plan: VolumePlan) -> None:
 def _sample_points(
     views: Sequence[DepthMapView],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Depths, pixel footprints and world points of a regular part of all pixels."""
+    """Depths, pixel footprints and world points of a regular subset of all pixels."""
     depths, footprints, points = [], [], []
     step = 0
     for view in views:
-        if not step:  # a view may be rendered when it is asked for; they are of one size
+        if not step:  # a view may be rendered on access; they are of one size
             pixels = len(views) * view.depth.numel()
             step = max(1, round((pixels / _SAMPLED_POINTS) ** 0.5))
         valid = view.valid()[::step, ::step]

@@ -1,4 +1,4 @@
-"""Small holes of a mesh, closed where nobody looked through them."""
+"""Closing of small holes of a mesh that no ray crosses."""
 
 from collections.abc import Callable, Iterator
 
@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 IsFree = Callable[[Float[np.ndarray, "k 3"]], Bool[np.ndarray, "k"]]
-"""Which points lie in space that was seen to be free."""
+"""Function that returns whether points lie in space that was seen to be free."""
 Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Positions and normals of vertices."""
+"""Function that returns positions and normals of vertices."""
 
 
 def closing_fans(
@@ -42,13 +42,13 @@ def border_loops(
 ) -> Iterator[Int[np.ndarray, "n k"]]:
     """Closed chains of three to ``most_edges`` edges that one face has, against their direction.
 
-    Those of each number of edges come together, each from its lowest vertex on. Chains through a
-    vertex where two borders meet are left out.
+    Chains of the same number of edges come together, each from its lowest vertex on. Chains through
+    a vertex where two borders meet are left out.
     """
     ends, first, counts = np.unique(border[:, 1], return_index=True, return_counts=True)
     ends, starts = ends[counts == 1], border[first[counts == 1], 0]
     place = np.searchsorted(ends, starts).clip(max=max(len(ends) - 1, 0))
-    # One more, which chains that end lead to, leads to itself.
+    # One more index, to which open chains lead, leads to itself.
     following = np.append(np.where(ends[place] == starts, place, len(ends)), len(ends))
     paths = np.arange(len(ends))[:, None]
     for edges in range(1, most_edges + 1):

@@ -1,4 +1,4 @@
-"""A mesh on the device where it was made."""
+"""Meshes as tensors, on the device where they were made."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _FACES_AT_ONCE = 2**17
-"""Faces that are looked at in float64 at a time; bounds memory."""
+"""Faces processed in float64 at a time; bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class TensorMesh:
     """Triangles in the world frame; faces turn counter-clockwise seen from free space."""
 
     vertices: Float[Tensor, "n 3"]
-    """float32, map units."""
+    """Positions, float32, map units."""
     faces: Int[Tensor, "m 3"]
-    """int64."""
+    """Vertices of each face, int64."""
 
     @staticmethod
     def of(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> "TensorMesh":
@@ -54,7 +54,7 @@ class TensorMesh:
 def vertex_sums(
     values: Float[Tensor, "m k"], faces: Int[Tensor, "m 3"], count: int
 ) -> Float[Tensor, "n k"]:
-    """Sum of what its faces have, of each of ``count`` vertices."""
+    """Sum of the faces' values at each of ``count`` vertices."""
     total = values.new_zeros(count, values.shape[1])
     add_at_corners(total, values, faces)
     return total
@@ -63,6 +63,6 @@ def vertex_sums(
 def add_at_corners(
     total: Float[Tensor, "n k"], values: Float[Tensor, "m k"], faces: Int[Tensor, "m 3"]
 ) -> None:
-    """Add what faces have to their corners' totals."""
+    """Add the faces' values to their corners' totals."""
     for corner in faces.unbind(1):
         total.index_add_(0, corner, values)

@@ -1,4 +1,4 @@
-"""The records of mesh extraction: what goes in and what comes out."""
+"""The records of mesh extraction: its input and output."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ class DepthMapView:
     """One depth map with its pose, as rendered from the map."""
 
     depth: Float[Tensor, "h w"]
-    """z in map units; zero, negative or not finite where nothing is known."""
+    """z in map units; zero, negative or not finite where unknown."""
     weight: Float[Tensor, "h w"]
     """Confidence, at least 0; 0 leaves the pixel out."""
     camera: Camera
@@ -36,7 +36,7 @@ class DepthMapView:
     """RGB of the same view, of any size; gives the vertices their colour."""
 
     def rgb(self) -> UInt8[np.ndarray, "ih iw 3"]:
-        """The image, asked for only where there is one."""
+        """The image, which must exist."""
         assert self.image is not None, "a view without an image shows no colours"
         return self.image
 
@@ -71,8 +71,8 @@ class Mesh(ShortRepr):
         return Mesh(self.vertices[origin], faces, normals, colours)
 
     def save(self, path: str | Path) -> None:
-        """Write a file that ends in .ply, .glb or .obj; the latter two have y up, and of GLB,
-        which is to be looked at, sharp edges have a vertex for each side.
+        """Write a file that ends in .ply, .glb or .obj. The latter two have y up; GLB, which is
+        for viewing, has a vertex for each side of a sharp edge.
 
         Raises:
             InputError: it ends otherwise.

@@ -1,1 +1,1 @@
-"""The networks' weights files: which there are, where they are, how they are read."""
+"""The networks' weights files: their catalogue, search and reading."""

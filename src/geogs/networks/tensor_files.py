@@ -41,10 +41,10 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 def load_trained(
     path: Path, kind: Literal["flow", "depth"], build: Callable[[dict[str, Any]], N]
 ) -> N:
-    """A network of ours as ``geogs train`` writes it, in single precision and ready to be run.
+    """Load a network written by ``geogs train``, in single precision and ready to run.
 
-    ``build`` makes it of what stands in the file about it: by name, the fields of dataclasses.
-    Raises InputError where the file is missing or another's.
+    ``build`` makes it from the file's metadata: the fields of dataclasses, by name.
+    Raises InputError if the file is missing or another's.
     """
     if not path.is_file():
         option = "--tracking.operator" if kind == "flow" else "--mapping.depth.engine"
@@ -60,7 +60,7 @@ def load_trained(
         about["options"] = {k: tuple(v) if isinstance(v, list) else v for k, v in options}
         network = build(about)
         network.load_state_dict(tensors)
-    except Exception as error:  # whatever another file makes the reader stumble over
+    except Exception as error:  # any error of the reader on another file
         raise InputError(
             f"{path} does not hold weights of our {kind} network ({in_short(error)})."
         ) from error
@@ -80,12 +80,12 @@ def _checkpoint(path: Path) -> object:
         with open_file(path) as file:
             return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        # Also raised for what is no pickle at all.
+        # Also raised for files that are no pickle at all.
         if "Unsupported global" in str(error):
             raise InputError(
                 f"{path} holds more than tensors, and reading the rest could run any program; "
                 "save its tensors alone (as safetensors) where you trust it."
             ) from error
         raise InputError(f"{path} is damaged, or no PyTorch checkpoint.") from error
-    except Exception as error:  # whatever a damaged file makes the reader stumble over
+    except Exception as error:  # any error of the reader on a damaged file
         raise InputError(f"{path} is damaged, or no PyTorch checkpoint.") from error

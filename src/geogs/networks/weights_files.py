@@ -1,6 +1,6 @@
-"""The weights files that can be used: where to get and find them, and whether they are intact.
+"""The weights files that can be used: their sources, the search for them, and their checksums.
 
-What is said of public files is from their own pages; checksums are those of the package's own.
+Facts about public files are from their own pages; only the package's own files have checksums.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ VARIABLE = "GEOGS_WEIGHTS"
 """Environment variable with a weights file, or a folder of them."""
 
 Purpose = Literal["own", "droid", "depth", "prior"]
-"""A flow operator, the depth network, or a monocular prior."""
+"""Use of a weights file: a flow operator, the depth network, or a monocular prior."""
 
 COMES_ALONG = "comes with geogs"
 
@@ -29,13 +29,13 @@ class KnownWeights:
     """A weights file that is known by name."""
 
     name: str
-    """File name under which it is looked for."""
+    """File name that is searched."""
     purpose: Purpose
-    """What uses it."""
+    """Use of the file."""
     what: str
-    """What it is, in a few words."""
+    """Description in a few words."""
     origin: str
-    """Where to get it."""
+    """Source of the file."""
     licence: str
 
 
@@ -64,11 +64,11 @@ CATALOGUE = (
         "CC0-1.0 by that page; BSD-2-Clause repository of the authors",
     ),
 )  # fmt: skip
-"""In the order of preference for each purpose."""
+"""The known files, in order of preference for each purpose."""
 
 
 def known_as(name: str) -> KnownWeights | None:
-    """What is known of a file of this name."""
+    """The catalogue's entry for a file name; None if there is none."""
     return next((known for known in CATALOGUE if known.name == name), None)
 
 
@@ -96,14 +96,14 @@ class Checksum:
 
 
 def weights_folders() -> list[Path]:
-    """Where weights are looked for: ``$GEOGS_WEIGHTS``, the user's cache, the package."""
+    """Folders that are searched: ``$GEOGS_WEIGHTS``, the user's cache, the package."""
     chosen = os.environ.get(VARIABLE)
     folders = [Path(chosen)] if chosen and Path(chosen).is_dir() else []
     return [*folders, cache_folder() / "weights", PACKAGED]
 
 
 def locate(known: KnownWeights) -> Path | None:
-    """Where a known file is, None if nowhere."""
+    """Path of a known file; None if it is nowhere."""
     chosen = Path(os.environ.get(VARIABLE) or ".")
     paths = [chosen] if chosen.name == known.name else []
     paths += [folder / known.name for folder in weights_folders()]
@@ -111,7 +111,7 @@ def locate(known: KnownWeights) -> Path | None:
 
 
 def located(purpose: Purpose) -> Path | None:
-    """Where the first known file for a purpose is, None if there is none."""
+    """Path of the first known file for a purpose; None if there is none."""
     paths = (locate(known) for known in CATALOGUE if known.purpose == purpose)
     return next((path for path in paths if path is not None), None)
 
@@ -119,8 +119,8 @@ def located(purpose: Purpose) -> Path | None:
 def find_weights(purpose: Purpose, chosen: str = "") -> Path:
     """The weights file for a purpose: the chosen one, else what is found.
 
-    ``$GEOGS_WEIGHTS`` may be a file (of any name that does not say that it is for something else)
-    or a folder; then come the user's cache directory and the package.
+    ``$GEOGS_WEIGHTS`` may be a file (unless its name is known for another purpose) or a folder;
+    then come the user's cache directory and the package.
 
     Raises InputError if there is none.
     """

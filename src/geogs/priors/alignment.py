@@ -16,7 +16,7 @@ _BINS = 12
 """Bins of the cells, by their value, between whose medians lines are tried."""
 _ROUNDS = 8
 _CUT = 2.0
-"""Deviations at which a cell counts a quarter (Geman and McClure's weight)."""
+"""Deviations at which a cell has a quarter of its weight (Geman and McClure's weight)."""
 
 
 def align_inverse_depth(
@@ -31,8 +31,8 @@ def align_inverse_depth(
     A scale alone is the weighted median ratio. Scale and shift minimise the weighted relative
     error by reweighted least squares (Geman and McClure), begun at the best line through the
     medians of two parts of the cells, so that wrong cells do not matter while they are fewer.
-    ``inverse_depth`` is the tracker's, ``weight`` how much each cell counts (0: not known).
-    None where too few cells are known, or where the prior says that near is far.
+    ``inverse_depth`` is the tracker's, ``weight`` the weight of each cell (0: not known).
+    None if too few cells are known, or if the prior confuses near and far.
     """
     finite = torch.isfinite(values)
     known = finite & (weight > 0) & (inverse_depth > 0)
@@ -47,7 +47,7 @@ def align_inverse_depth(
         scale = weighted_median(d * x, w)
         aligned = torch.where(finite, scale * inverse, 0.0)
     else:
-        # Both are fits of y = a x + b whose error is measured in parts of y.
+        # Both are fits of y = a x + b whose error is relative to y.
         y = d if kind is DepthKind.AFFINE_INVERSE else 1 / d
         fitted = _robust_line(x, y, w)
         if fitted is None:

@@ -18,16 +18,16 @@ Number = Annotated[float, Range(-1e6, 1e6)]
 
 @dataclass(frozen=True)
 class PriorCard:
-    """Input and output of a network. Images are RGB unless ``channels`` says BGR."""
+    """Input and output of a network. Images are RGB unless ``channels`` is BGR."""
 
     name: str
     source: str
-    """Where the network is described, and where its file comes from."""
+    """Source of the network's description and of its file."""
     licence: str
     note: str = ""
-    """What a user should know; what could not be confirmed."""
+    """Remarks for the user; facts that could not be confirmed."""
     resize: Literal["stretch", "at_least", "pad", "multiple"] = "stretch"
-    """How an image is brought to a size that the network takes. Stretched: to exactly ``height`` x
+    """Method to bring an image to a size that the network takes. Stretched: to exactly ``height`` x
     ``width``, whatever the aspect. At least: aspect kept, both sides at least these, then to the
     next multiple. Padded: aspect kept, as large as fits into these, the rest padded evenly.
     Multiple: as it is, padded evenly to the next multiple."""
@@ -35,14 +35,14 @@ class PriorCard:
     width: CountOrZero = 0
     multiple: Count = 1
     interpolation: Literal["linear", "cubic", "area"] = "linear"
-    """How the image is resized on its way in."""
+    """Interpolation by which the image is resized."""
     channels: Literal["rgb", "bgr"] = "rgb"
     full_scale: Number = 1.0
     """Value of white before ``mean`` and ``std``: 1 or 255."""
     mean: tuple[Number, ...] = (0.0, 0.0, 0.0)
     std: tuple[Positive, ...] = (1.0, 1.0, 1.0)
     padding: tuple[Number, ...] = (0.0, 0.0, 0.0)
-    """Colour of what is padded, on the full scale."""
+    """Colour of the padding, on the full scale."""
     image_input: str = ""
     """Name of the input for the image; none takes the only one."""
     camera_input: str = ""
@@ -50,9 +50,9 @@ class PriorCard:
     depth_output: str = ""
     """Name of the output with depth or inverse depth; none takes the only one."""
     depth_kind: Literal["metric", "scale_free", "affine_depth", "affine_inverse"] | None = None
-    """What it means; none where the network gives no depth."""
+    """Meaning of that output; None if the network gives no depth."""
     depth_range: tuple[Number, ...] = ()
-    """Least and largest value that means anything; others are clamped."""
+    """Least and largest meaningful value; others are clamped."""
     normal_output: str = ""
     """Name of the output with normals, three channels or more; none takes the only one."""
     normal_axes: str = ""
@@ -82,7 +82,7 @@ class PriorCard:
 
     @property
     def kind(self) -> DepthKind | None:
-        """What the network's depth means; None without."""
+        """Meaning of the network's depth; None without depth."""
         return None if self.depth_kind is None else DepthKind(self.depth_kind)
 
     @property
@@ -98,9 +98,9 @@ def card_names() -> list[str]:
 
 
 def load_card(name: str) -> PriorCard:
-    """A card by the name of one that comes with geogs, or a YAML file.
+    """Load a card: one that comes with geogs, by its name, or a YAML file.
 
-    Raises InputError if there is none or if it does not say what it must.
+    Raises InputError if there is none, or if its settings are incomplete or wrong.
     """
     shipped = _CARDS / f"{name}.yaml"
     path = shipped if "/" not in name and shipped.is_file() else Path(name)
@@ -133,7 +133,7 @@ def _from_settings(name: str, content: dict[Any, Any]) -> PriorCard:
 
 
 def _value(kind: Kind, value: Any) -> Any:
-    """A value of YAML as its field has it, where it can be one."""
+    """Convert a value of YAML to the type of its field, where possible."""
     if isinstance(value, list):
         return tuple(_value(kind, v) for v in value)
     is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53

@@ -46,12 +46,12 @@ class SensorDepth:
     """Measured inverse depth."""
 
     inverse_depth: Float32[np.ndarray, "h w"]
-    """Per metre; 0 where unknown."""
+    """Inverse depth per metre; 0 where unknown."""
     deviation: Float32[np.ndarray, "h w"]
-    """Its standard deviation; infinite where unknown."""
+    """Standard deviation of it; infinite where unknown."""
 
     def at_cells(self, offset: int, stride: int, height: int, width: int) -> "SensorDepth":
-        """At every ``stride``-th pixel from ``offset`` on, the mean of the pixels around.
+        """Means of the pixels around every ``stride``-th pixel from ``offset`` on.
 
         On a plane the mean is the pixel's own value without noise; the errors of neighbours are
         correlated, so that 25 of them count as ``INDEPENDENT``.

@@ -1,4 +1,4 @@
-"""Images at the size that a network takes, and its maps at that of the image."""
+"""Resizing of images to the size that a network takes, and of its maps to that of the image."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ _INTERPOLATION = {
     "area": cv2.INTER_AREA,
 }
 MIN_NORMAL = 0.2
-"""Shorter normals than this mean that the network does not know."""
+"""Length below which a normal counts as unknown."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class FittedImage:
         return K[None]
 
     def back(self, values: Float[np.ndarray, "nh nw *c"]) -> Float[np.ndarray, "h w *c"]:
-        """A map of the network at the size of the image, without what was padded.
+        """Bring a map of the network to the size of the image, without the padding.
 
         A map of another resolution than the network's image is first brought to that.
         """
@@ -56,7 +56,7 @@ class FittedImage:
 
 
 def fit_image(image: UInt8[np.ndarray, "h w 3"], card: PriorCard) -> FittedImage:
-    """An RGB image resized, padded, ordered and normalised as a card says."""
+    """Resize, pad, order and normalise an RGB image as a card prescribes."""
     height, width = image.shape[:2]
     inner, outer = _sizes(height, width, card)
     scaled: np.ndarray = image.astype(np.float32) * np.float32(card.full_scale / 255)
@@ -80,7 +80,7 @@ def prior_maps(
 ) -> PriorMaps:
     """A network's outputs as depth and normals at the size of the image, on the CPU.
 
-    Raises InputError where one does not have the shape that it must.
+    Raises InputError if one has a wrong shape.
     """
     return PriorMaps(
         card.kind or DepthKind.SCALE_FREE,

@@ -33,10 +33,10 @@ class PriorMaps:
     """Maps of a prior for one image, at its size; either may be missing."""
 
     kind: DepthKind = DepthKind.SCALE_FREE
-    """What the numbers of ``depth`` mean."""
+    """Meaning of the numbers of ``depth``."""
     depth: Float[Tensor, "h w"] | None = None
-    """Depth or inverse depth as ``kind`` says; NaN where unknown, as is a depth that is not
-    positive where the kind has no shift."""
+    """Depth or inverse depth, by ``kind``; NaN where unknown, as is a depth that is not positive
+    if the kind has no shift."""
     normal: Float[Tensor, "h w 3"] | None = None
     """Unit normals in the camera frame (x right, y down, z forward) that face the camera, so that
     a wall seen straight on has (0, 0, -1); zero where unknown."""
@@ -44,7 +44,7 @@ class PriorMaps:
 
 @runtime_checkable
 class MonocularPrior(Protocol):
-    """Guesses depth or normals from single images."""
+    """Predicts depth or normals from single images."""
 
     def predict(self, image: UInt8[np.ndarray, "h w 3"]) -> PriorMaps:
         """Maps of an RGB image, at its size; tensors may be on any device."""

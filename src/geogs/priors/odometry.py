@@ -15,7 +15,7 @@ ROTATION_DEG = 0.15
 FIT = 16.8
 """Largest squared normalised difference (six degrees of freedom) of motions that fit: 99 %."""
 PROPOSALS = 256
-"""Scales that are tried at most, evenly chosen along the path."""
+"""Most scales that are tried, evenly chosen along the path."""
 ROUNDS = 10
 """Rounds of reweighting."""
 
@@ -25,11 +25,11 @@ class ScaleVote:
     """Scale between motions of the images and measured ones."""
 
     scale: float
-    """Metres to the unit of the images' motions."""
+    """Metres per unit of the images' motions."""
     deviation: float
     """Relative standard deviation of the scale; infinite where it is unknown."""
     fits: Bool[Tensor, "m"]
-    """Which motions fit at that scale."""
+    """Whether each motion fits at that scale."""
 
     @property
     def fraction(self) -> float:
@@ -53,8 +53,8 @@ def vote_on_scale(
     """The scale at which most motions seen in the images fit those that were measured in metres.
 
     Each pair proposes the ratio of its lengths; the proposal with the highest sum of Cauchy's
-    weights is refined by reweighted least squares, each round solved outright as the scale is
-    linear, beside the least-squares loop. Rotations have to fit, too.
+    weights is refined by reweighted least squares. The problem is linear in the scale, so each
+    round solves it directly, without the general least-squares loop. Rotations have to fit, too.
     """
     information = information_of(measured, config)
     rotation_error = so3_log(measured[:, :3, :3].mT @ seen[:, :3, :3])

@@ -1,4 +1,4 @@
-"""A prior from an ONNX file and a card that says what the network wants and gives."""
+"""A prior from an ONNX file and a card that describes the network's input and output."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -84,7 +84,7 @@ def _open(model: Path, device: torch.device) -> Any:
 
 
 def _said(error: Exception) -> str:
-    """The reason in brackets, in letters that a terminal can show; nothing where there is none."""
+    """The reason in brackets, in letters that a terminal can show; empty if there is none."""
     lines = str(error).encode("ascii", "replace").decode().split("\n")
     words = "".join(c if c.isprintable() else "?" for c in lines[0])[:200].strip(" .")
     return f" ({words})" if words else ""

@@ -16,9 +16,9 @@ NEIGHBOURS = 12
 """Points of the local plane fit: enough for noise to average, few enough to follow edges."""
 MIN_COSINE = 0.15
 """Least cosine of a disk's normal to its own camera: one that is seen edge-on gets no gradient."""
-# Scale of points in one place, map units.
+# Scale of coinciding points, map units.
 _LEAST_SCALE = 1e-7
-# Margin around some points, over their extent, in which neighbours are searched first.
+# Margin around some points, relative to their extent, in which neighbours are searched first.
 _MARGIN = 0.05
 
 
@@ -33,7 +33,7 @@ class LocalPlane:
     planarity: Float[Tensor, "n"]
     """(l1 - l0) / l2 in [0, 1]: near 1 on an evenly sampled plane, 0 on a line or a blob."""
     spacing: Float[Tensor, "n"]
-    """Root mean square distance to the three nearest other points, as 3DGS has it, map units."""
+    """Root mean square distance to the three nearest other points, as in 3DGS, map units."""
 
 
 def fit_local_planes(
@@ -63,7 +63,7 @@ def _neighbourhoods(
 ) -> tuple[Float[Tensor, "n j"], Float[Tensor, "n j 3"]]:
     """Distances and positions of the k + 1 nearest of points and context, float64.
 
-    Of a large context only the points nearby are searched, if they are enough.
+    In a large context only nearby points are searched, if they suffice.
     """
     low, high = points.amin(0), points.amax(0)
     margin = _MARGIN * (high - low).norm()
@@ -79,7 +79,7 @@ def _neighbourhoods(
 def fit_local_planes_on_gpu(
     points: Float[Tensor, "n 3"], context: Float[Tensor, "m 3"], k: int
 ) -> LocalPlane:
-    """The same without waiting for the device, neighbours by float32 distances; k <= 31."""
+    """``fit_local_planes`` without waiting for the device, by float32 distances; k <= 31."""
     union = torch.cat([points, context]).detach().float().contiguous()
     neighbours = all_pairs_neighbors(union[: len(points)], union, min(k + 1, len(union)))
     return LocalPlane(*(x.to(points.dtype) for x in principal_planes(union, neighbours)))
@@ -111,11 +111,11 @@ def initialise_disks(
     """Disks at ``points`` (world frame), lying in the planes of their neighbourhoods.
 
     Where ``seen``, unit normals (world frame) that face the camera, is given and not zero, it
-    stands for the neighbourhood's, however slanted.
-    ``camera_centre`` is that of the camera that sees them, or of one for each.
+    replaces the neighbourhood's, however slanted.
+    ``camera_centre`` is the centre of the camera that sees them, or one for each.
     ``footprint`` is the distance between neighbouring samples at each point's depth; the spacing
     is kept within [0.3, 1.5] of it so that a stray point makes neither a speck nor a blanket.
-    Without ``bound_spacing`` it is what it is, as in the paper. Where planarity is under the
+    Without ``bound_spacing`` it is not bounded, as in the paper. Where planarity is under the
     threshold the scale shrinks, as the paper does with a factor 0.1.
     """
     if len(points) == 0:
@@ -147,10 +147,10 @@ def random_disks(
     opacity: float,
     random: torch.Generator,
 ) -> DiskParameters:
-    """Disks at ``points`` as 3DGS starts its Gaussians, with orientations uniform over all.
+    """Disks at ``points``, initialised like the Gaussians of 3DGS, with random orientations.
 
-    They are round, with the root mean square distance to the three nearest of ``points`` and
-    ``existing`` for their scale; nothing shrinks or bounds it.
+    They are round; their scale is the root mean square distance to the three nearest of ``points``
+    and ``existing``, neither shrunk nor bounded.
     """
     count = len(points)
     # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.

@@ -26,9 +26,9 @@ class LearningRates(NamedTuple):
 class MapOptimizer:
     """Adam (Kingma & Ba 2015) on a map's disks on a CPU, with a step count per disk.
 
-    Only disks given as visible are stepped: the moments and the step counts of the others stand
-    still, so a disk out of view neither drifts nor forgets. Bias correction uses each disk's own
-    count. The moments are the map's, and follow its disks as they come, go and move.
+    Only disks given as visible are stepped: the moments and the step counts of the others stay, so
+    a disk out of view neither drifts nor forgets. Bias correction uses each disk's own count. The
+    moments belong to the map, and follow its disks as they are added, removed and moved.
     """
 
     def __init__(self, disks: GaussianMap, learning_rates: LearningRates) -> None:
@@ -37,7 +37,7 @@ class MapOptimizer:
         self._corrections = _bias_corrections(BETAS[0]), _bias_corrections(BETAS[1])
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Discard the gradients."""
         for p in self.disks.parameters:
             p.grad = None
 

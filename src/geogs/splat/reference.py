@@ -23,7 +23,7 @@ MIN_TRANSMITTANCE = 1e-4
 MIN_FACING = 1e-4
 """Lower bound of |cos| between a disk's normal and the line to its centre."""
 MAX_HIT_RATIO = 1e4
-"""A hit further away than this multiple of the centre's depth does not count."""
+"""Largest depth of a hit that counts, as a multiple of the centre's depth."""
 MAX_LOG_SCALE = 40.0
 """Larger or smaller disks are ignored."""
 MAX_REACH_RATIO = 1e3
@@ -41,7 +41,7 @@ class ProjectedDisks(NamedTuple):
     """
 
     rows: Tensor
-    """Their indices among all disks."""
+    """Indices among all disks."""
     center: Tensor
     tangents: tuple[Tensor, Tensor]
     normal: Tensor
@@ -51,7 +51,7 @@ class ProjectedDisks(NamedTuple):
     scale: Tensor
     opacity: Tensor
     reach: tuple[Tensor, Tensor]
-    """How far the disk extends in front of and behind its centre, along z; constants."""
+    """Extent of the disk in front of and behind its centre, along z; constants."""
 
 
 class PixelValues(NamedTuple):
@@ -109,7 +109,7 @@ def render_reference(
 
 
 def project_disks(disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float) -> ProjectedDisks:
-    """Disks into the camera frame, without those that no pixel can blend, sorted by centre depth.
+    """Move disks to the camera frame, without those that no pixel can blend, sorted by depth.
 
     Left out are disks whose centre is not beyond ``near``, whose opacity is below ``MIN_ALPHA``,
     whose quaternion is zero, whose log-scale exceeds ``MAX_LOG_SCALE`` or that hold a number that

@@ -84,7 +84,7 @@ def parameters_of(disks: GaussianMap | DiskParameters | MapSnapshot) -> DiskPara
 
 
 def chosen_backend(disks: DiskParameters, backend: Backend) -> Literal["reference", "cpu", "cuda"]:
-    """What renders the disks. Raises ValueError if that cannot be the one that was asked for."""
+    """The backend that renders the disks. Raises ValueError if the requested one cannot."""
     if backend == "auto":
         position = disks.position
         fits = position.dtype == torch.float32 and position.device.type in ("cpu", "cuda")

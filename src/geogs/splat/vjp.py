@@ -31,16 +31,16 @@ class RenderGradients:
     """Gradients of a loss of one rendering, on the disks' device."""
 
     disks: DiskParameters
-    """With respect to every disk, before activation; zero for disks that are not visible."""
+    """Gradients of every disk's parameters, before activation; zero for disks not visible."""
     T_cw: Float64[Tensor, "4 4"]
-    """With respect to the entries of the pose; the last row is zero."""
+    """Gradients of the entries of the pose; the last row is zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class PullBack:
     """Takes gradients with respect to the maps of a rendering back to disks and pose.
 
-    It is linear, and may be called again. What the rendering left for it is kept as long as it is;
+    It is linear, and may be called again. It keeps the data of the rendering as long as it exists;
     disks and pose must not be changed in place before the last call. On a GPU it is called in the
     stream of the rendering.
     """
@@ -57,7 +57,7 @@ class PullBack:
     ) -> RenderGradients:
         """Gradients of a loss, given its gradients by the maps (zero for those left out).
 
-        Raises ValueError if none is given, or one has not its map's shape.
+        Raises ValueError if none is given, or one does not have its map's shape.
         """
         given = {"depth": depth, "normal": normal, "alpha": alpha, "distortion": distortion}
         if all(g is None for g in given.values()):
@@ -80,7 +80,7 @@ def render_vjp(
     backend: Backend = "auto",
     near: float = NEAR,
 ) -> tuple[RenderOutput, PullBack]:
-    """Render as :func:`geogs.render` does, and return what gives the gradients.
+    """Render as :func:`geogs.render` does, and return a function that computes the gradients.
 
     The maps belong to no graph of PyTorch's, and neither pass goes through its engine, whose
     thread takes longer than the kernels of a small view on a GPU::
@@ -90,7 +90,7 @@ def render_vjp(
         gradients = pull_back(depth=2 * error)  # of the sum of squares
         gradients.disks.position, gradients.T_cw
 
-    A GPU is not waited for but for its projection of the disks. ``reference`` gives the same by
+    The host waits for a GPU only until the disks are projected. ``reference`` gives the same by
     autograd, to compare with.
     """
     parameters = DiskParameters(*(p.detach() for p in parameters_of(disks)))

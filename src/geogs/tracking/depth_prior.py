@@ -6,14 +6,13 @@ in between: s(u) = B(u) . s. Inverse depths d and scales minimise
     sum_e w |target - project(d)|^2  +  sum_u alpha(u) (d(u) - s(u) d_prior(u))^2
         +  sum_nodes (s_i - s_j)^2 / step^2 ,
 
-the last sum over neighbouring nodes. HI-SLAM2 has 2 x 2 nodes without that last term, and gives
-alpha as a number that belongs to its network's weights. Here weights of flow are inverse variances,
-so alpha is one, too: 1 / (deviation * d)^2; and with more nodes, held together by their usual
-differences, the prior lends its shape and the matches around a bare wall lend their scale.
+the last sum over neighbouring nodes. HI-SLAM2 has 2 x 2 nodes without that last term, and a fixed
+alpha tuned to its network's weights. Here weights of flow are inverse variances, so alpha is one,
+too: 1 / (deviation * d)^2. With more nodes, coupled by their usual differences, the prior gives the
+shape of a bare wall and the matches around it the scale.
 
-It is no term of :mod:`geogs.bundle` and does not go through its loop: a single step is taken, whose
-elimination is formed so that it does not cancel, and what is repeated is the judgement of the prior
-from the same start.
+It is no term of :mod:`geogs.bundle` and does not use its loop: a single step is taken, eliminated
+in a form that does not cancel, and only the weights of the prior are iterated, from the same start.
 """
 
 from dataclasses import dataclass
@@ -32,9 +31,9 @@ from geogs.world.grid import SampleGrid
 DEVIATION = 0.05
 """Relative deviation of a good prior after its scale has been adjusted."""
 REACH = 0.06
-"""Matched depth judges the prior around it within about this fraction of the grid's width."""
+"""Distance within which matched depth tests the prior, about, as a fraction of the grid's width."""
 MAX_DEVIATION = 0.15
-"""Cells where the prior seems to be worse than this go without it: three times a good one's."""
+"""Relative deviation above which a cell does not use the prior: three times a good one's."""
 MAX_DISAGREEMENT = 0.2
 """A prior that is off by more than this in a fifth of the matched cells is not used at all."""
 SCALE_DAMPING = 1e-4
@@ -42,31 +41,31 @@ SCALE_DAMPING = 1e-4
 DEPTH_DAMPING = 1e-3
 """Damping of inverse depth without a prior, relative to the mean curvature of its frame."""
 REWEIGHTINGS = 3
-"""Times that the prior is judged and fitted anew in one adjustment."""
+"""Rounds of testing and fitting the prior in one adjustment."""
 EDGES_TOGETHER = 24
 """Edges that are linearised at a time; bounds memory."""
 LIMITS = 1e-3, 1e2
-"""Inverse depths that a step ends at."""
+"""Smallest and largest inverse depth after a step."""
 _CAUCHY = 2.0
 """Deviations at which a cell of the prior counts half in the fit of the scales."""
 _EVIDENCE = ((1.0, 8.0), (3.0, 2.0), (9.0, 0.5))
-"""Windows in multiples of the reach, and how many cells a window full of evidence counts as."""
+"""Window sizes in multiples of the reach, and the weight of each, in cells, if full of evidence."""
 _BELIEF = 0.5
-"""Cells that the deviation of a good prior counts as before there is evidence."""
+"""Weight of the deviation of a good prior, in cells of evidence."""
 _AGREEING = 0.8
-"""Part of the matched cells whose agreement decides on a prior; a bad one fits half of them."""
+"""Quantile of the matched cells' errors by which a prior is rejected; a bad one fits half."""
 _ROUGHNESS = 3.0
-"""Deviation of a cell for the deviation of the scale around it."""
+"""Ratio of a cell's deviation to the deviation of the scale around it."""
 
 
 @dataclass(frozen=True)
 class FlowEvidence:
-    """The matches' term in the inverse depths of a problem's frames, linearised."""
+    """Term of the matches in the inverse depths of a problem's frames, linearised."""
 
     curvature: Float[Tensor, "n p"]
     """C = sum w |dp/dd|^2."""
     gradient: Float[Tensor, "n p"]
-    """b = sum w r . dp/dd; the matches alone want the step b / C."""
+    """b = sum w r . dp/dd; the step of the matches alone is b / C."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class ScaledPrior:
     inverse_depth: Float[Tensor, "n p"]
     """d_prior; 0 where unknown."""
     scale: Float[Tensor, "n k"]
-    """One at each node."""
+    """Scale at each node."""
     weight: Float[Tensor, "n p"]
     """alpha, 1 / inverse depth^2; 0 where unknown."""
 
@@ -90,19 +89,19 @@ class DepthScaleStep:
 
 
 def node_weights(grid: SampleGrid, rows: int, columns: int) -> Float[Tensor, "p k"]:
-    """Weight B of each node's scale in each cell; rows sum to one."""
+    """Return the weight B of each node's scale in each cell; rows sum to one."""
     y, x = (_hats(n, k, grid) for n, k in ((grid.height, rows), (grid.width, columns)))
     return torch.einsum("hr,wc->hwrc", y, x).reshape(grid.size, rows * columns)
 
 
 def _hats(cells: int, nodes: int, grid: SampleGrid) -> Float[Tensor, "n k"]:
-    """Linear interpolation between nodes along one side of the grid."""
+    """Return weights of linear interpolation between nodes along one side of the grid."""
     at = torch.linspace(0, nodes - 1, cells, device=grid.device)[:, None]
     return (1 - (at - torch.arange(nodes, device=grid.device)).abs()).clamp(min=0)
 
 
 def node_differences(rows: int, columns: int) -> Float[Tensor, "k k"]:
-    """The matrix L of sum over neighbouring nodes of (s_i - s_j)^2 = s . L s."""
+    """Return the matrix L with sum over neighbouring nodes of (s_i - s_j)^2 = s . L s."""
     node = torch.arange(rows * columns).reshape(rows, columns)
     i = torch.cat([node[:, 1:].reshape(-1), node[1:].reshape(-1)])
     j = torch.cat([node[:, :-1].reshape(-1), node[:-1].reshape(-1)])
@@ -113,7 +112,7 @@ def node_differences(rows: int, columns: int) -> Float[Tensor, "k k"]:
 
 
 def flow_evidence(grid: SampleGrid, problem: BundleProblem, huber: float) -> FlowEvidence:
-    """Curvature and gradient of the matches' term in the inverse depth of every frame."""
+    """Compute curvature and gradient of the matches' term in the inverse depth of every frame."""
     d = problem.inverse_depth
     curvature, gradient = torch.zeros_like(d), torch.zeros_like(d)
     motion = relative_motion(problem.T_cw, problem.source, problem.target)
@@ -134,12 +133,12 @@ def depth_scale_step(
     basis: Float[Tensor, "p k"],
     stiffness: Float[Tensor, "k k"],
 ) -> DepthScaleStep:
-    """The Gauss-Newton step of inverse depths and scales; frames are independent.
+    """Compute the Gauss-Newton step of inverse depths and scales; frames are independent.
 
-    Inverse depths are eliminated (Schur). What is left of the prior's term is a fit of the scales
-    to the depth that the matches want, d + b / C, with the weight alpha C / (alpha + C) of the
-    difference of two measurements; it is formed as such, since H - E C'^-1 E^T would cancel.
-    ``stiffness`` is the matrix of the nodes' term for scales about one.
+    Inverse depths are eliminated (Schur). The prior's term then fits the scales to the depth from
+    matches, d + b / C, with the weight alpha C / (alpha + C) of the difference of two measurements;
+    it is formed this way, since H - E C'^-1 E^T would cancel. ``stiffness`` is the matrix of the
+    nodes' term for scales of about one.
     """
     C, b, alpha = flow.curvature, flow.gradient, prior.weight
     known = alpha > 0
@@ -150,7 +149,7 @@ def depth_scale_step(
     S, g = S.double(), g.double()
     curvature = (alpha * prior.inverse_depth.square()) @ basis.square()
     S = S + torch.diag_embed(SCALE_DAMPING * curvature.double() + 1e-12)
-    # Scales differ by parts of their mean, so that the unit of depth does not matter.
+    # Scales differ by fractions of their mean, so that the unit of depth does not matter.
     relative = stiffness / prior.scale.double().mean(1).square()[:, None, None]
     S = S + relative
     g = g - (relative @ prior.scale.double()[..., None])[..., 0]
@@ -162,7 +161,7 @@ def depth_scale_step(
 
 
 def _node_products(weight: Float[Tensor, "n p"], basis: Float[Tensor, "p k"]) -> Tensor:
-    """sum_u weight(u) B(u) B(u)^T of every frame, (n, k, k)."""
+    """Return sum_u weight(u) B(u) B(u)^T of every frame, (n, k, k)."""
     return torch.stack([basis.mT @ (w[:, None] * basis) for w in weight])
 
 
@@ -173,7 +172,7 @@ class AdjustedDepth:
     inverse_depth: Float[Tensor, "n p"]
     scale: Float[Tensor, "n k"]
     information: Float[Tensor, "n p"]
-    """alpha: what the prior adds to the inverse variance of inverse depth; 0 where it is unused."""
+    """alpha: the prior's inverse variance of inverse depth; 0 where it is not used."""
 
 
 def adjust_depth(
@@ -184,12 +183,12 @@ def adjust_depth(
     scale: Float[Tensor, "n k"],
     config: PriorConfig,
 ) -> AdjustedDepth:
-    """One JDSA step with weights that follow how well each prior agrees with the matches.
+    """Take one JDSA step, with each prior weighted by its agreement with the matches.
 
-    The scales are fitted, the prior is judged by the depth that matches want (:func:`local
-    deviation <local_deviation>`), and that is repeated with the new weights. Cells where the prior
-    seems bad, and frames where it is bad on the whole, keep what the matches say. Without
-    ``config.reject`` every cell has the weight of a good prior, as in JDSA itself.
+    The scales are fitted, the prior is tested by the depth from matches (:func:`local deviation
+    <local_deviation>`), and this is repeated with the new weights. Cells with a bad prior, and
+    frames where it is bad overall, keep the depth from matches. Without ``config.reject`` every
+    cell has the weight of a good prior, as in JDSA itself.
     """
     basis = node_weights(grid, config.scale_rows, config.scale_columns)
     stiffness = node_differences(config.scale_rows, config.scale_columns).to(basis).double()
@@ -202,7 +201,7 @@ def adjust_depth(
     step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, scale, alpha), basis, stiffness)
     good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
     good &= (scale + step.scale > 0).all(1, keepdim=True)
-    taken = good & (alpha > 0)  # what goes without the prior has just been adjusted to the matches
+    taken = good & (alpha > 0)  # cells without the prior have just been adjusted to the matches
     return AdjustedDepth(
         torch.where(taken, (inverse_depth + step.depth).clamp(*LIMITS), inverse_depth),
         torch.where(good, scale + step.scale, scale),
@@ -218,7 +217,7 @@ def _judged(
     basis: Float[Tensor, "p k"],
     stiffness: Float[Tensor, "k k"],
 ) -> Float[Tensor, "n p"]:
-    """Weights of priors by how well they agree with the matches, from those of ``good`` ones."""
+    """Weight priors by their agreement with the matches, starting from the weights in ``good``."""
     C, prior, start, alpha = flow.curvature, good.inverse_depth, good.scale, good.weight
     wanted = inverse_depth + torch.where(C > 0, flow.gradient / C.clamp(min=1e-30), 0.0)
     deviation = torch.full_like(prior, DEVIATION)
@@ -248,11 +247,11 @@ def local_deviation(
     error: Float[Tensor, "n p"],
     confidence: Float[Tensor, "n p"],
 ) -> Float[Tensor, "n p"]:
-    """Relative deviation of the prior in every cell, by its errors in well-known cells around it.
+    """Estimate the prior's relative deviation in every cell from errors in well-known cells nearby.
 
-    The root of a weighted mean of squared errors in windows of three sizes, the smaller the more
-    it counts, and of that of a good prior, which stands alone where nothing is known.
-    ``confidence`` in [0, 1] says how well the matches know a cell, beside the prior.
+    The root of a weighted mean of squared errors in windows of three sizes, of which smaller ones
+    count more, and of the variance of a good prior, which alone remains where nothing is known.
+    ``confidence`` in [0, 1]: information of the matches on a cell, relative to that of the prior.
     """
     shape = (-1, grid.height, grid.width)
     square = (confidence * error.square().clamp(max=1.0)).reshape(shape)
@@ -266,9 +265,9 @@ def local_deviation(
 
 
 def roughness(grid: SampleGrid, factor: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-    """Relative deviation of the scale within reach of a cell.
+    """Return the relative deviation of the scale within reach of a cell.
 
-    A scale that has to change fast to follow the matches says little between them.
+    A scale that changes fast to follow the matches is unreliable between them.
     """
     radius = REACH * grid.width
     field = factor.double().reshape(-1, grid.height, grid.width)
@@ -278,13 +277,13 @@ def roughness(grid: SampleGrid, factor: Float[Tensor, "n p"]) -> Float[Tensor, "
 
 
 def mean_around(field: Float[Tensor, "n h w"], radius: float) -> Float[Tensor, "n h w"]:
-    """Mean over a square window, cut at the border; float64."""
+    """Return the mean over a square window, cut at the border; float64."""
     k = max(1, round(radius))
     return _means_along(_means_along(field.double(), k).mT, k).mT
 
 
 def _means_along(field: Float[Tensor, "n h w"], k: int) -> Float[Tensor, "n h w"]:
-    """Means along rows over the k cells on either side, from a running sum."""
+    """Return means along rows over the k cells on either side, from a running sum."""
     width = field.shape[-1]
     running = F.pad(field.cumsum(-1), (1, 0))
     at = torch.arange(width, device=field.device)
@@ -298,7 +297,7 @@ def _prior_weight(
     basis: Float[Tensor, "p k"],
     deviation: Float[Tensor, "n p"],
 ) -> Float[Tensor, "n p"]:
-    """alpha = 1 / (deviation s d_prior)^2, 0 where there is no prior."""
+    """Return alpha = 1 / (deviation s d_prior)^2, 0 where there is no prior."""
     scaled = prior * (scale @ basis.mT)
     known = scaled > 0
     return torch.where(known, 1 / (deviation * scaled).square().clamp(min=1e-30), 0.0)
@@ -307,7 +306,7 @@ def _prior_weight(
 def _weighted_quantile(
     values: Float[Tensor, "n p"], weight: Float[Tensor, "n p"], fraction: float
 ) -> Float[Tensor, "n"]:
-    """The value of every row below which that fraction of its weight lies; NaN without weight."""
+    """Return the weighted quantile of every row; NaN without weight."""
     ordered, order = values.sort(dim=1)
     total = weight.gather(1, order).cumsum(1)
     place = torch.searchsorted(total, fraction * total[:, -1:]).clamp(max=values.shape[1] - 1)

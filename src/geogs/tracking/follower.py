@@ -1,4 +1,4 @@
-"""Frames that come while others still work on a new keyframe: where they are, and nothing more."""
+"""Localisation of frames while another thread completes a new keyframe."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,28 +17,26 @@ from geogs.world.keyframes import Keyframe
 from geogs.world.segments import LastFrame
 
 PATIENCE = 1.0
-"""How much farther than what calls for a keyframe a frame may be from the unfinished one, as a
-fraction of that."""
+"""Relative excess over the keyframe distance that a frame may have from the unfinished keyframe."""
 MAX_FRAMES = 60
 """Most frames whose images wait with a follower."""
 
 
 @dataclass(frozen=True)
 class FollowedFrame:
-    """A frame and where it was found."""
+    """A frame and its pose."""
 
     frame: Frame
     encoded: Any
     motion: FrameMotion
     T_rel: Float[Tensor, "4 4"]
-    """The new keyframe to this frame, in the keyframe's lengths when the follower was made."""
+    """New keyframe to this frame, in the keyframe's lengths when the follower was made."""
 
 
 class Follower:
-    """Locates frames at a keyframe as it was when it was made, whatever becomes of it meanwhile.
+    """Locates frames by a copy of a new keyframe, which is being completed meanwhile.
 
-    It changes nothing that others know of: the tracker takes over what it has found when the
-    keyframe is finished.
+    It changes no shared data: the tracker takes over its results when the keyframe is finished.
     """
 
     def __init__(
@@ -50,25 +48,25 @@ class Follower:
         anchor: Keyframe,
         motion: FrameMotion,
     ) -> None:
-        """``last`` is relative to ``keyframe``, the new one, ``motion`` by which its frame was
-        located at another, ``anchor``; neither keyframe may change any more."""
+        """``last`` is relative to ``keyframe``, the new one; ``motion`` located its frame at
+        another, ``anchor``. Neither keyframe may change any more."""
         self.last = last
-        """Where the last frame was, relative to the keyframe as it was."""
+        """Pose of the last frame, relative to the copied keyframe."""
         self.frames: list[FollowedFrame] = []
-        """All that were found so far, earliest first."""
+        """Frames located so far, earliest first."""
         self._locator, self._config = locator, config
         self._keyframe, self._anchor, self._motion = keyframe, anchor, motion
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
-        """World to camera of the last frame, by the keyframe as it was."""
+        """World to camera of the last frame, by the copied keyframe."""
         return self.last.T_cw(self._keyframe)
 
     def follow(self, frame: Frame) -> FollowedFrame | None:
-        """Find the next frame; None where that takes more than the keyframe as it was.
+        """Locate the next frame; None where the unfinished keyframe is not enough.
 
-        So it is where the camera is not near where it is expected, or has moved so far that
-        another keyframe is overdue, and after a cut.
+        That is where the camera is far from its predicted pose, or has moved so far that another
+        keyframe is overdue, and after a cut.
         """
         last, config, keyframe = self.last, self._config, self._keyframe
         camera = keyframe.grid.camera
@@ -97,5 +95,5 @@ class Follower:
         return self.frames[-1]
 
     def deviation(self) -> DeviationOf:
-        """Computes how well the last frame's pose is known relative to its keyframe."""
+        """Return a function for the deviations of the last pose relative to its keyframe."""
         return deviation_of(self._anchor.grid, self._anchor, self._motion)

@@ -1,4 +1,4 @@
-"""What the lens of each frame between keyframes has of its own, by the frame's own matches."""
+"""Per-frame intrinsics of frames between keyframes, from each frame's own matches."""
 
 from collections.abc import Iterator, Mapping
 
@@ -26,10 +26,10 @@ from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
 STEPS = 5
-"""Of Gauss and Newton, of each frame's pose and lens together."""
+"""Gauss-Newton steps of each frame's pose and lens together."""
 
 Sizes = Float64[Tensor, "3"]
-"""Of what a frame's lens has of its own: ``FrameLens.sizes``."""
+"""Per-frame intrinsics: ``FrameLens.sizes``."""
 
 
 def sizes_of_frames(
@@ -38,14 +38,14 @@ def sizes_of_frames(
     of_keyframes: Mapping[int, Sizes],
     varies: VaryingPrior,
 ) -> dict[int, Sizes]:
-    """What the lenses of all frames that have a place have of their own, by their indices.
+    """Estimate the intrinsics of all located frames, by their indices.
 
     Args:
-        log: frames, with what was found of them in keyframes.
-        of_keyframes: the same of keyframes, by the indices of their frames; it is taken for right,
-            and so are poses and depths.
-        varies: by how much the lens of a frame differs from those of the keyframes around,
-            interpolated.
+        log: frames, with their matches from keyframes.
+        of_keyframes: intrinsics of keyframes, by the indices of their frames; assumed exact, as are
+            poses and depths of keyframes.
+        varies: prior on the difference between a frame's intrinsics and those interpolated from the
+            keyframes around.
     """
     known = sorted(of_keyframes)
     table = torch.stack([of_keyframes[n] for n in known]).numpy()
@@ -78,7 +78,7 @@ def sizes_of_frames(
 
 
 def shift_frames(log: FrameLog, keyframes: KeyframeSet, lenses: Mapping[int, FrameLens]) -> None:
-    """Correct what was found of frames by what the lenses of both have of their own."""
+    """Store the correction of the frames' matches for the intrinsics of both images."""
     sizes = {n: torch.tensor(lens.sizes).double() for n, lens in lenses.items()}
     poses = solved_poses(log, keyframes)
     grid = keyframes.grid
@@ -96,16 +96,16 @@ def shifts_of_own(
     at: CellProjection,
     own: Float[Tensor, "e 2 3"],
 ) -> Float[Tensor, "e p 2"]:
-    """What is to be added to where cells were found, as if the lens of all had seen both images.
+    """Return the shifts of matches to the positions that the shared lens would give.
 
     Args:
-        camera: that of all.
+        camera: shared camera.
         rays: of the cells.
         T_ji: from the camera of each edge's source to that of its target.
-        at: where the cells fall.
-        own: what the lenses of each edge's source and target have of their own.
+        at: projections of the cells.
+        own: per-frame intrinsics of each edge's source and target.
     """
-    # Whatever the size, but for the step of the cell, which is carried over to first order.
+    # Exact for any size, except that the shift of the source cell is propagated to first order.
     (source, target), sizes = own.unbind(1), own.new_zeros(len(own), 2, SHAPES)
     sizes[:, 0, list(OWN)] = torch.cat([-(-source[:, :1]).expm1(), source[:, 1:]], 1)
     factor = target[:, :1].exp()
@@ -120,7 +120,7 @@ def _shifts(
     poses: Mapping[int, Float[Tensor, "4 4"]],
     sizes: Mapping[int, Sizes],
 ) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, "e p 2"]]:
-    """Relative motions from keyframes to frames, and what is to be added to the matches."""
+    """Return relative motions from keyframes to frames, and the shifts of the matches."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     T = torch.stack([poses[n] for n in frames]) @ se3_inverse(keyframes.poses(ids))
@@ -140,7 +140,7 @@ def _equations(
     poses: Mapping[int, Float[Tensor, "4 4"]],
     sizes: Mapping[int, Sizes],
 ) -> Iterator[tuple[list[int], Float64[Tensor, "e 9 10"]]]:
-    """Frames, and normal equations of each of their observations with their right sides."""
+    """Yield frames, and normal equations of each of their observations with right sides."""
     grid = keyframes.grid
     cells, own = sparse_cells(grid), list(OWN)
     for part, ids in seen_by_keyframes(log, keyframes):

@@ -1,4 +1,4 @@
-"""How well a tracker knows its frames: the keyframes around them, and each by its own matches."""
+"""Standard deviations of frames: from the keyframes around them, and from their own matches."""
 
 import math
 from dataclasses import replace
@@ -21,19 +21,19 @@ from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
 EXPECTED_RESIDUAL = math.sqrt(2 * math.log(2))
-"""Median length of an error in two dimensions, in its deviations."""
+"""Median length of a two-dimensional error, in standard deviations per axis."""
 CAUTION = 4 / 3
-"""Ratio of the errors of frames between keyframes to those foretold: the matches of a frame err
-alike. Read off rendered videos (docs/notebook/uncertainty.md has the table)."""
+"""Ratio of actual to predicted errors of frames between keyframes: the errors of a frame's matches
+are correlated. Measured on rendered videos (docs/notebook/uncertainty.md has the table)."""
 
 
 def frame_uncertainty(tracker: Tracker) -> Uncertainty:
-    """Deviations of all tracked frames of a tracker that has a map, by its present edges.
+    """Return deviations of all tracked frames of a tracker that has a map, by its present edges.
 
-    A frame between keyframes is as far off as they are (their deviations, interpolated in
-    time), and by what its own few matches leave open beside (:func:`own_deviations`); every frame
-    by what is not known of the camera's motion while its rows were read (:func:`row_twists`); all
-    are independent. Depths are those of the keyframes around.
+    The error of a frame between keyframes is that of the keyframes (deviations interpolated in
+    time) plus that of its own few matches (:func:`own_deviations`). Every frame also has the error
+    of the camera's unknown motion during readout (:func:`row_twists`). All are independent. Depths
+    are those of the keyframes around.
     """
     log, keyframes = tracker.map.recorder.log, tracker.keyframes
     tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
@@ -56,12 +56,11 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
 
 
 def own_deviations(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, PoseDeviation]:
-    """Deviations of frames between keyframes relative to these, by the indices of the frames.
+    """Return deviations of frames between keyframes relative to these, by frame index.
 
-    What the matches of a frame leave open at its solution (:func:`left_open`), a match being as
-    unsure as their residuals are long: deviations times the frame's median residual over the one
-    to be expected, and times ``CAUTION``. Frames that no match tells of are left out.
-    Source: the variance factor a posteriori of least squares, by a median for robustness.
+    They follow from the frame's normal equations at its solution (:func:`left_open`), times the
+    frame's median residual over the expected one, and times ``CAUTION``. Frames without matches are
+    left out. Source: the variance factor a posteriori of least squares, by a median for robustness.
     """
     grid, found = keyframes.grid, dict[int, PoseDeviation]()
     cells = sparse_cells(grid)

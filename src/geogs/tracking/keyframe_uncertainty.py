@@ -1,4 +1,4 @@
-"""How well a tracker knows its keyframes, by what all its matches leave open."""
+"""Standard deviations of a tracker's keyframes, from the covariance of all its matches."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -32,37 +32,37 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
 CELLS = 512
-"""Most cells of a keyframe whose matches stand for all."""
+"""Most cells of a keyframe whose matches represent all."""
 OPTIONS = BundleOptions(huber=HUBER, depth_damping=1e-5, chunk=96)
-"""How matches are linearised, many edges at a time as few cells are looked at. More damping of the
-depths would count as evidence against a drift of scale, which takes them all along."""
+"""Options of the linearisation: many edges at a time, as cells are few. More damping of the depths
+would count as evidence against a drift of scale, which changes them all."""
 TOGETHER = 300
-"""Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
+"""Most keyframes whose poses are solved jointly; longer videos are split into parts."""
 USUAL_RESIDUAL = 0.23
-"""Median residual, in deviations of a match, where the scene is as modelled: read off rendered
+"""Median residual, in deviations of a match, where the scene is as modelled: measured on rendered
 videos (docs/notebook/uncertainty.md has the table)."""
 FLAWLESS_RESIDUAL = 0.26
-"""The same where nothing is wrong, at most: 0.21 to 0.26."""
+"""Largest such residual of videos without flaws: 0.21 to 0.26."""
 MIN_SHARED = 0.2
-"""Least shared part of the cells for one structure to hold two edges (:func:`largest_part`): views
-of a place seen again, which may be all that joins two stretches, have less in common than those of
-a start."""
+"""Least shared fraction of the cells for a rigid connection of two edges (:func:`largest_part`):
+views of a revisited place, which may be the only link between two stretches, have less in common
+than those of a start."""
 LEAST_FITTING = 0.9
-"""Quantile of the keyframes' residuals that stands for those whose matches fit least."""
+"""Quantile of the keyframes' residuals that represents those whose matches fit worst."""
 
 
 def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> Uncertainty:
-    """Uncertainty of all keyframes of a tracker that has a map, from its present edges; ``errors``
-    are those of its frames' rows where they were solved already.
+    """Estimate the uncertainty of all keyframes of a tracker that has a map, from its present
+    edges; ``errors`` are those of its frames' rows, if already solved.
 
-    What it says of poses is what is left of their errors when the trajectory is laid over the truth
-    by a similarity, for frame and unit of the map are anyone's
+    Pose deviations are those of the errors left after alignment with the truth by a similarity, as
+    frame and unit of the map are arbitrary
     (:func:`~geogs.bundle.uncertainty.gauge.deviations_after_alignment`). In the world of a saved
-    map: of the keyframes that it did not bring, relative to it.
+    map: of its new keyframes, relative to it.
 
     In a video of more than ``TOGETHER`` keyframes each part begins where the one before it ended,
-    and deviations are relative to the first keyframe: errors add up along the way whatever loops
-    say, and what is said of it is rather too much.
+    and deviations are relative to the first keyframe: errors add up along the path regardless of
+    loops, so deviations are rather too large.
     """
     ids = tracker.segment.free
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
@@ -86,8 +86,8 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
         squares = squares + propagated
         position[part], rotation[part] = np.sqrt(squares).T
         propagated = squares[-1] if not tracker.segment.fixed else propagated
-    # Of a lens that was found, what was said when it was: matches on images that are straight by
-    # it agree with it.
+    # An estimated lens keeps the deviation of its estimate: matches on images straightened by it
+    # agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
     focal = max(open_, math.sqrt(focal))
     fixed, edges = set(tracker.segment.fixed), tracker.map.graph.edges
@@ -100,11 +100,11 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
 
 
 def misfit(residuals: Float[np.ndarray, "n"]) -> float:
-    """How much longer than the median keyframe's residual, or one without flaws, is that of the
-    tenth of the keyframes whose matches fit least; 0 where no matches are known.
+    """Return the residual of the tenth of the keyframes whose matches fit worst, over that of the
+    median keyframe, or of one without flaws; 0 where no matches are known.
 
-    Of keyframes that are placed rightly it is below 1.3: noise, blur and bare walls are in all of
-    a video, and matches say how sure they are. Above it are those where tracking has failed.
+    It is below 1.3 where poses are right: noise, blur and bare walls affect all of a video, and
+    weights of matches account for them. Above it tracking has failed.
     """
     known = residuals[np.isfinite(residuals)]
     if not len(known):
@@ -115,9 +115,9 @@ def misfit(residuals: Float[np.ndarray, "n"]) -> float:
 def said_of_lens(
     tracker: Tracker, ids: list[int], rows: RowErrors | None = None
 ) -> LensEvidence | None:
-    """Evidence on the lens by the edges between some keyframes, earliest first.
+    """Return the evidence on the lens in the edges between some keyframes, earliest first.
 
-    And on the readout by which ``rows`` err, where there are any.
+    Also on the readout, if ``rows`` are given.
     """
     found = None
     for part in _parts(ids):
@@ -131,10 +131,10 @@ def said_of_lens(
 def said_of_frame_lenses(
     tracker: Tracker, ids: list[int]
 ) -> list[tuple[list[int], VaryingEvidence]]:
-    """Evidence on the lens of each keyframe by the edges between some, earliest first.
+    """Return the evidence on the lens of each keyframe in the edges between some, earliest first.
 
-    Of more than ``TOGETHER`` keyframes in parts, each with its own, which share the last of one
-    and the first of the next.
+    More than ``TOGETHER`` keyframes are split into parts; the last keyframe of one is the first of
+    the next.
     """
     found = []
     for part in _parts(ids):
@@ -146,14 +146,14 @@ def said_of_frame_lenses(
 
 
 def _parts(ids: list[int]) -> Iterator[slice]:
-    """Spans of ids that are solved jointly; the last of one is the first of the next."""
+    """Yield spans of ids that are solved jointly; the last of one is the first of the next."""
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         yield slice(first, first + TOGETHER + 1)
 
 
 @dataclass(frozen=True)
 class _Matches:
-    """Some keyframes' poses and depths as they are, and the edges between them."""
+    """Present poses and depths of some keyframes, and the edges between them."""
 
     keyframes: KeyframeSet
     problem: StreamedProblem
@@ -161,7 +161,7 @@ class _Matches:
 
     @staticmethod
     def among(tracker: Tracker, ids: list[int]) -> "_Matches | None":
-        """The matches of some keyframes; none where no edge joins them."""
+        """Return the matches of some keyframes; None where no edge joins them."""
         free = ids if tracker.segment.fixed else ids[1:]
         among = {*ids, *tracker.segment.fixed}
         edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
@@ -172,38 +172,38 @@ class _Matches:
 
     @property
     def grid(self) -> SampleGrid:
-        """The grid of their cells."""
+        """Sample grid of their cells."""
         return self.keyframes.grid
 
     def lens(self, rows: RowErrors | None, of_depths: bool = False) -> LensEvidence | None:
-        """Evidence on the lens, and on the readout that ``rows`` are for; nothing where they
-        do not tell of all poses."""
+        """Return the evidence on the lens, and on the readout of ``rows``; None where matches do
+        not determine all poses."""
         slope = None if rows is None else partial(self._slope, rows)
         return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope, of_depths)
 
     def frame_lenses(self) -> VaryingEvidence | None:
-        """Evidence on the lens of each keyframe."""
+        """Return the evidence on the lens of each keyframe."""
         return varying_evidence(self.grid, self.problem, OPTIONS)
 
     def lens_change(self, said: VaryingEvidence) -> float:
-        """Part of their cost that lenses of their own would take off."""
+        """Return the relative cost reduction by per-frame intrinsics."""
         step, _ = said.told(self.times, torch.zeros_like(said.gradient), FIRST, self.shared)
         return max(0.0, said.explained(step))
 
     @property
     def times(self) -> Float64[Tensor, "n"]:
-        """Seconds, of the keyframes."""
+        """Times of the keyframes, seconds."""
         each = [self.keyframes[k].timestamp for k in self.frames]
         return torch.tensor(each, dtype=torch.float64)
 
     @property
     def shared(self) -> Float64[Tensor, "5"]:
-        """Deviations of the lens that all share."""
+        """Prior deviations of the shared lens."""
         prior = lens_prior(self.keyframes.table.focal_deviation)
         return torch.tensor(prior, dtype=torch.float64)
 
     def considered_lenses(self, said: VaryingEvidence, own: Mapping[int, FrameLens]) -> Considered:
-        """What is left open of these, of which the keyframes have some of their own."""
+        """Return the errors of per-frame intrinsics, given the present estimates ``own``."""
         each = [own.get(k, FrameLens()) for k in self.frames]
         return considered_lenses(
             said, self.grid, self.problem, OPTIONS, CELLS,
@@ -214,7 +214,7 @@ class _Matches:
     def _slope(
         self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
     ) -> Float[Tensor, "e p 2"]:
-        """Derivatives of matches, where cells fall, by the factor on the readout."""
+        """Return derivatives of matches, at the projected cells, by the factor on the readout."""
         i, j = ([self.keyframes[self.frames[n]].frame_index for n in x] for x in (
             part.source.tolist(), part.target.tolist()
         ))  # fmt: skip
@@ -224,11 +224,10 @@ class _Matches:
 
 
 def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marginals | None:
-    """Marginals of some keyframes, with what all their matches have wrong in common.
+    """Compute the marginals of some keyframes, including the common errors of all their matches.
 
-    They hold where the scene is not as modelled, too: matches are as many times as unsure as they
-    say as their residuals are longer than usual. What is known of the lens does not hang on that,
-    nor of the readout that ``rows`` were seen over.
+    To hold where the scene is not as modelled, too, deviations of matches are scaled by the ratio
+    of their residuals to the usual ones. Those of the lens and of the readout of ``rows`` are not.
     """
     matches = _Matches.among(tracker, ids)
     if matches is None:

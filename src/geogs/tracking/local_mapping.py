@@ -1,4 +1,4 @@
-"""New keyframes of a started map: linked to their neighbours, adjusted with them, and culled."""
+"""Local mapping: new keyframes are linked to their neighbours, adjusted with them, and culled."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,9 +23,9 @@ from geogs.world.keyframes import Keyframe
 DEEPER = 3
 """Keyframes before the window of adjusted poses whose inverse depths are adjusted, too."""
 PROXIMITY_WINDOW = 25
-"""Older keyframes among which further neighbours of a new one are looked for, as in DROID-SLAM."""
+"""Older keyframes searched for further neighbours of a new one, as in DROID-SLAM."""
 PROXIMITY_DISTANCE = 0.2
-"""Largest frame distance of such neighbours, of the long edge."""
+"""Largest frame distance of such neighbours, as a fraction of the long edge."""
 PROXIMITY_PAIRS = 2
 """Most such neighbours per keyframe: bounds the time."""
 ROUNDS = 2
@@ -33,7 +33,7 @@ ROUNDS = 2
 ITERATIONS = 3
 """Gauss-Newton steps per round."""
 REMEASURE = 0.5
-"""A pair is matched again when its reprojection has moved by this many pixels."""
+"""Change of its reprojection, in pixels, after which a pair is matched again."""
 
 
 class LocalMapping:
@@ -53,19 +53,19 @@ class LocalMapping:
 
     @property
     def deep(self) -> list[int]:
-        """Ids whose inverse depth it moves, earliest first."""
+        """Ids whose inverse depth the local adjustment moves, earliest first."""
         fixed = {*self.segment.fixed}
         latest = self.keyframes.ids[-(self.config.window + DEEPER) :]
         return [k for k in latest if k not in fixed]
 
     @property
     def lasting(self) -> Sequence[int]:
-        """Ids that are removed no more: but for the latest, about which the next one decides."""
+        """Ids that will not be removed: all but the latest, which may be culled after the next."""
         ids = self.keyframes.ids
         return ids[:-1] if self.config.keyframe_distance else ids
 
     def insert(self, frame: Frame, encoded: Any, motion: FrameMotion) -> Keyframe:
-        """Make a located frame a keyframe, with the depths that its anchor gives it."""
+        """Make a located frame a keyframe, with depths propagated from its anchor."""
         anchor = self.keyframes[motion.keyframe]
         keyframe = self.map.add(frame, encoded, motion.T_cw)
         self._propagate_depths(anchor, keyframe)
@@ -74,8 +74,8 @@ class LocalMapping:
         return keyframe
 
     def extend(self, record: FrameRecord, id: int, motion: FrameMotion) -> None:
-        """Make a located frame, which was the keyframe ``id`` before the map was started, the
-        earliest keyframe or the latest, linked to those beside it and adjusted with them."""
+        """Restore a located frame, keyframe ``id`` before the map was started, as the earliest or
+        latest keyframe; link it to its neighbours and adjust them."""
         keyframe = self.map.restore(record, id, motion.T_cw)
         self._propagate_depths(self.keyframes[motion.keyframe], keyframe)
         ids, fixed = self.keyframes.ids, {*self.segment.fixed}
@@ -98,7 +98,7 @@ class LocalMapping:
     ) -> None:
         """Link a new keyframe to its neighbours and adjust them.
 
-        ``anchor`` is the keyframe at which it was located; without ``culls`` none is culled.
+        ``anchor`` is the keyframe at which it was located; without ``culls`` no keyframe is culled.
         """
         self.map.complete(keyframe, rotations)
         self._link(keyframe, anchor)
@@ -120,7 +120,7 @@ class LocalMapping:
         )
 
     def _propagate_dynamic(self, anchor: int, keyframe: Keyframe) -> None:
-        """Mark as dynamic in a new keyframe what is so in the anchor it was measured against."""
+        """Propagate dynamic cells of the anchor to a new keyframe."""
         (pixels,), (weight,) = edge_matches(
             self.keyframes.grid, [self.graph.edges[keyframe.id, anchor]]
         )
@@ -128,8 +128,8 @@ class LocalMapping:
         keyframe.moving = propagated(self.keyframes.grid, moving, pixels, weight)
 
     def _connect(self, later: Sequence[int], earlier: Sequence[int], located: Pair) -> None:
-        """Measure a new keyframe, the only one of the later or of the earlier, against the one it
-        was located at, and its neighbours."""
+        """Measure flow between a new keyframe (the only one of ``later`` or of ``earlier``), the
+        keyframe at which it was located, and its neighbours."""
         pairs = proximity_pairs(
             self.keyframes,
             later,
@@ -140,7 +140,7 @@ class LocalMapping:
             PROXIMITY_DISTANCE * self._long_edge,
             RADIUS + PROXIMITY_PAIRS,
         )
-        # Neighbours in time are none where the camera was lost in between.
+        # Neighbours in time do not count where the camera was lost in between.
         breaks = self.segment.breaks
         broken = [p for p in pairs if any(p[0] < b <= p[1] for b in breaks)]
         there, back = frame_distances(self.keyframes, broken + [p[::-1] for p in broken]).chunk(2)
@@ -149,7 +149,7 @@ class LocalMapping:
         self.graph.measure({*pairs, located}, fine=False)
 
     def _adjust(self, poses: Sequence[int], depths: Sequence[int]) -> None:
-        """Rounds of bundle adjustment, with flow measured anew where poses have moved."""
+        """Run rounds of bundle adjustment; measure flow again where poses have changed."""
         moving, deep = set(poses), set(depths)
         for n in range(ROUNDS):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]
@@ -170,7 +170,7 @@ class LocalMapping:
             return
         before, id = ids[-3], ids[-2]
         if [self.keyframes[k].measured is not None for k in ids[-3:]] == [False, True, False]:
-            return  # the only one around whose depth was measured
+            return  # the only one nearby with sensor depth
         distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
         if float(distance) < self.config.keyframe_distance * self._long_edge:
             self.map.cull(id, before)

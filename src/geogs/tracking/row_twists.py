@@ -1,9 +1,9 @@
-"""Velocity of the camera while it reads a frame, by the rows of the frame's own matches.
+"""Velocity of the camera while it reads a frame, from the rows of the frame's own matches.
 
-A polynomial through the poses around a frame takes the course between images for smooth. A camera
-that is knocked has another velocity, its rows are sheared, and the pose follows the shear. But the
-matches of the frame tell its velocity beside its pose: each cell is moved by it in proportion to
-the time of its row.
+A polynomial through the poses around a frame assumes smooth motion between images. A camera that is
+knocked has another velocity, its rows are sheared, and the pose follows the shear. But the matches
+of the frame determine velocity and pose: the velocity moves each cell in proportion to the time of
+its row.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,14 +27,14 @@ from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
 EVIDENCE = 0.02
-"""Fraction of what matches say of rows that counts, as those of an edge err together."""
+"""Weight of the matches' evidence on rows, as the errors of an edge are correlated."""
 
 
 class _Matches(NamedTuple):
     """Matches that end in frames."""
 
     source: list[int]
-    """Frames that they begin in."""
+    """Frames of the sources."""
     target: list[int]
     T_ji: Float[Tensor, "e 4 4"]
     rays: Float[Tensor, "p 3"]
@@ -49,9 +49,9 @@ class RowTwists(NamedTuple):
 
     frames: list[int]
     twist: Float64[Tensor, "n 6"]
-    """Per second, beside that of the trajectory; a left perturbation of the frame's pose."""
+    """Twist per second, beyond that of the trajectory; a left perturbation of the frame's pose."""
     leaves_open: list[PoseDeviation]
-    """Deviations of the frames' poses, which follow what is not known of the twists."""
+    """Deviations of the frames' poses due to errors of the twists."""
 
 
 def row_twists(
@@ -61,20 +61,20 @@ def row_twists(
     log: FrameLog,
     are_corrected: bool = False,
 ) -> RowTwists:
-    """Twists of frames while they were read, by the matches that end in them.
+    """Estimate twists of frames during readout, from the matches that end in them.
 
-    Each is estimated together with a step of the frame's pose, and is known before to be as small
-    as two polynomials through the poses around differ (:meth:`RowErrors.twist_deviations`). Depths,
-    and the poses of the frames that matches begin in, are taken for right.
-    Source: pose and velocity from one image of a rolling shutter (Ait-Aider et al. 2006), with what
-    is known of the velocity before by Bayes' rule.
+    Each is estimated together with a step of the frame's pose. Its prior deviation is the
+    difference of two polynomials through the poses around (:meth:`RowErrors.twist_deviations`).
+    Depths, and the poses of the source frames, are assumed exact.
+    Source: pose and velocity from one image of a rolling shutter (Ait-Aider et al. 2006), with a
+    prior on the velocity.
 
     Args:
-        errors: of rows by the present trajectory, of the readout that is taken for right.
+        errors: row errors by the present trajectory, for the assumed readout.
         edges: matches between keyframes.
-        log: frames, with what was found of them in keyframes.
-        are_corrected: whether the matches are corrected for the rows already; else as ``errors``
-            say.
+        log: frames, with their matches from keyframes.
+        are_corrected: whether the matches are already corrected for the rows; if not, ``errors``
+            correct them here.
     """
     frames, A = _summed(errors, keyframes, edges, log, are_corrected)
     return RowTwists(frames, *solved_twists(A, errors.twist_deviations(frames)))
@@ -87,9 +87,9 @@ def part_seen(
     edges: Mapping[Pair, Edge],
     log: FrameLog,
 ) -> float:
-    """How far matches want the twists of frames to be from those of ``errors`` towards those of
-    ``others``, by least squares: 0 where the former are right, 1 where the latter are, and 0 where
-    nothing tells. Matches are not corrected for the rows yet."""
+    """Fit the twists of frames on the line from those of ``errors`` (0) to those of ``others`` (1)
+    to the matches, by least squares; 0 where they are not determined. Matches are not yet corrected
+    for the rows."""
     frames, A = _summed(errors, keyframes, edges, log, False)
     way = (others.twists(frames) - errors.twists(frames))[..., None]
     _, S, g = _of_twists(A)
@@ -104,8 +104,8 @@ def _summed(
     log: FrameLog,
     are_corrected: bool,
 ) -> tuple[list[int], Float64[Tensor, "n 12 13"]]:
-    """Frames that matches end in, and the normal equations of a step of the pose and the twist of
-    each, with their right sides."""
+    """Return the target frames of the matches, and the normal equations of a step of each one's
+    pose and twist, with right sides."""
     sums: dict[int, Float64[Tensor, "12 13"]] = {}
     for part in chain(  # some edges at a time, as their equations take memory
         _of_keyframes(keyframes, edges), _of_frames(errors, keyframes, log, are_corrected)
@@ -124,9 +124,8 @@ def _summed(
 def solved_twists(
     A: Float64[Tensor, "n 12 13"], deviation: Float64[Tensor, "n 6"]
 ) -> tuple[Float64[Tensor, "n 6"], list[PoseDeviation]]:
-    """Most likely twists, and what they leave open of the poses, by the normal equations of steps
-    of the poses and twists, with their right sides, ``EVIDENCE`` of which counts, and the twists'
-    deviations before."""
+    """Solve for the most likely twists, and the resulting deviations of the poses, from the normal
+    equations of poses and twists, weighted by ``EVIDENCE``, and the twists' prior deviations."""
     follow, S, g = _of_twists(EVIDENCE * A)
     eye = torch.eye(6, dtype=A.dtype)
     rows, columns = deviation[..., None], deviation[:, None]
@@ -139,7 +138,7 @@ def solved_twists(
 def _of_twists(
     A: Float64[Tensor, "n 12 13"],
 ) -> tuple[Float64[Tensor, "n 6 6"], Float64[Tensor, "n 6 6"], Float64[Tensor, "n 6 1"]]:
-    """How poses follow twists, and the twists' own equations once poses are eliminated."""
+    """Eliminate poses: return their dependence on the twists, and the equations of the twists."""
     H, v = A[..., :12], A[..., 12:]
     of_pose, both, of_twist = H[:, :6, :6], H[:, 6:, :6], H[:, 6:, 6:]
     largest = of_pose.diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-9)
@@ -151,7 +150,7 @@ def _of_twists(
 def _equations(
     errors: RowErrors, keyframes: KeyframeSet, m: _Matches
 ) -> Float64[Tensor, "e 12 13"]:
-    """Normal equations of each edge, for a step of the target's pose and its twist."""
+    """Return normal equations of each edge, for a step of the target's pose and its twist."""
     p = linearise(keyframes.grid.camera, m.rays, m.T_ji, m.inverse_depth)
     weight = depth_aware_weight(m.weight, p.depth_jacobian, m.information)
     r, w = weighed_residuals(p, m.pixels, weight, HUBER)

@@ -1,4 +1,4 @@
-"""Segments of video: each tracked by itself until a loop joins it to the main map."""
+"""Segments of video, each tracked separately until a loop joins it to the main map."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -26,20 +26,20 @@ from geogs.world.segments import (
 )
 
 Recall = Callable[[UInt8[np.ndarray, "h w 3"]], Sequence[Recognition]]
-"""Recognises keyframes of any segment in an image; most alike first."""
+"""Recognises keyframes of any segment in an image; most similar first."""
 
 MIN_ORIENTED = 0.5
-"""Fraction of the frames whose orientation has to be known where nothing else is: fewer are
-pictures of different things rather than a camera that only rotates."""
+"""Fraction of the frames whose orientation has to be known where positions are not: fewer mean
+pictures of different scenes rather than a rotating camera."""
 
 
 class Segments:
     """Trackers of the segments of a video, one of which is the main map.
 
-    A camera that stays lost although there is something to see starts a new segment, with a gauge
-    of its own. Meanwhile every image is compared with the keyframes of all segments: where one is
-    recognised, tracking goes on there, and a segment that has not been started is dropped. One that
-    has been waits until a loop says where it lies, and then becomes part of the main map.
+    A camera that stays lost although images have texture starts a new segment, with its own gauge.
+    Meanwhile every image is compared with the keyframes of all segments. Where one is recognised,
+    tracking continues there, and the current segment is dropped if it has no map yet. One that has
+    a map waits until a loop links it, and then becomes part of the main map.
     Source: the atlas of ORB-SLAM3 (Campos et al. 2021), with one map.
     """
 
@@ -52,7 +52,7 @@ class Segments:
         prior: MonocularPrior | None = None,
         defers: bool = False,
     ) -> None:
-        """``table`` is what is known so far, and is changed in place; ``defers`` as a tracker."""
+        """``table`` is the state so far, changed in place; ``defers`` as in :class:`Tracker`."""
         self.table = table
         self._keyframes = keyframes
         self._patience = config.tracking.patience
@@ -67,12 +67,12 @@ class Segments:
 
     @property
     def main(self) -> Tracker:
-        """The tracker of the main map."""
+        """Tracker of the main map."""
         return self._trackers[self.table.main]
 
     @property
     def current(self) -> Tracker:
-        """The tracker of the segment in which the camera is."""
+        """Tracker of the camera's present segment."""
         return self._trackers[self.table.current]
 
     @property
@@ -86,19 +86,19 @@ class Segments:
         return self.main.segment.ids
 
     def tracker_of(self, id: int) -> Tracker:
-        """The tracker that has a keyframe. Raises KeyError if none does."""
+        """Return the tracker that has a keyframe. Raises KeyError if none does."""
         for tracker in self._trackers.values():
             if id in tracker.keyframes:
                 return tracker
         raise KeyError(id)
 
     def trajectory(self) -> Trajectory:
-        """Poses of all frames seen so far; those of other segments count as not tracked."""
+        """Return the poses of all frames so far; those of other segments count as not tracked."""
         others = [t for t in self.trackers if t is not self.main]
         return self.main.trajectory([r for t in others for r in t.map.recorder.log.records])
 
     def summary(self) -> list[SegmentFate]:
-        """All segments so far that were started, earliest first."""
+        """Return summaries of all segments with a map, earliest first."""
         present = [
             _fate(t, "world" if t is self.main else "apart")
             for t in self.trackers
@@ -107,14 +107,14 @@ class Segments:
         return sorted([*present, *self.table.joined], key=lambda s: s.first_time)
 
     def settle(self) -> None:
-        """Wait until the table holds all that threads are measuring."""
+        """Wait until the table includes the results of all threads."""
         for tracker in self._trackers.values():
             tracker.settle()
 
     # --- writing ---------------------------------------------------------------------------
 
     def join(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
-        """Make a segment part of another, given the Sim(3) from the host's gauge to the guest's.
+        """Join a segment to another, given the Sim(3) from the host's gauge to the guest's.
 
         Returns the ids of the guest's keyframes that were final.
         """
@@ -128,14 +128,14 @@ class Segments:
         return final
 
     def place_found(self, found: FoundFrames) -> None:
-        """Place frames in the main map that had no place there."""
+        """Insert relocalised frames into the main map."""
         others = [t.map.recorder for t in self.trackers if t is not self.main]
         self.main.map.recorder.place_found(found, others)
 
     # --- the stream ------------------------------------------------------------------------
 
     def track(self, frame: Frame, recall: Recall) -> TrackResult:
-        """Take the next frame; ``recall`` is asked where it is while the camera is lost.
+        """Track the next frame; while the camera is lost, ``recall`` recognises keyframes in it.
 
         Raises InputError if its size is not the camera's.
         """
@@ -144,7 +144,7 @@ class Segments:
         return replace(result, finalized=(*final, *result.finalized))
 
     def _cut(self) -> tuple[int, ...]:
-        """No motion links the next frame to those before it; ids that thereby became final."""
+        """Cut before the next frame, which no motion links; return ids that became final."""
         current = self.current
         if current.segment.status.has_map:
             current.cut()
@@ -173,14 +173,14 @@ class Segments:
         return self._reported(self.current.track(frame))
 
     def complete(self) -> TrackResult:
-        """What a new keyframe of a tracker that defers takes beyond its pose."""
+        """Complete the new keyframe of a deferring tracker."""
         return self._reported(self.current.complete())
 
     def finish(self) -> TrackResult:
-        """End of the stream: every keyframe becomes final, and the largest segment the main map.
+        """End the stream: every keyframe becomes final, and the largest segment the main map.
 
-        Where no segment could be started but the orientations of most frames are known, these are
-        what is left, and ``why_not`` says why. Raises TrackingLost if not even they are.
+        Where no segment could be started, the orientations of most frames may be known; then
+        ``why_not`` gives the reason. Raises TrackingLost if they are not.
         """
         finals: dict[Tracker, TrackResult] = {}
         for tracker in self.trackers:
@@ -195,7 +195,7 @@ class Segments:
                     raise
                 self.table.why_not = str(reason)
                 return TrackResult(tracker.segment.status.state)
-        # A saved map is the main one whatever else there is.
+        # A saved map is always the main one.
         largest = max(finals, key=lambda t: (bool(t.segment.fixed), len(t.keyframes)))
         if largest is self.main:
             return finals[largest]
@@ -203,7 +203,7 @@ class Segments:
         return replace(finals[largest], finalized=tuple(largest.segment.final), is_new_main=True)
 
     def _rejoin(self, frame: Frame, recognised: Sequence[Recognition]) -> TrackResult | None:
-        """Go on where the frame was recognised, in whatever segment."""
+        """Continue tracking where the frame was recognised, in whatever segment."""
         for tracker in self.trackers if recognised else ():
             if not tracker.segment.status.has_map:
                 continue
@@ -215,10 +215,10 @@ class Segments:
                 return result
         return None
 
-    # --- segments that come and go ---------------------------------------------------------
+    # --- start and end of segments ---------------------------------------------------------
 
     def _begin_segment(self) -> None:
-        """Go on in a new segment, whose keyframe ids follow all others'."""
+        """Start a new segment, whose keyframe ids follow all others."""
         segment = VideoSegment(self.table.count, self._keyframes.new_set())
         self.table.count += 1
         self.table.segments.append(segment)
@@ -226,7 +226,7 @@ class Segments:
         self._trackers[segment.number] = self._new_tracker(segment)
 
     def _drop(self, tracker: Tracker) -> None:
-        """Give up a segment that has not been started."""
+        """Drop a segment that has no map."""
         is_current = tracker is self.current
         self._remove(tracker)
         if self.table.main == tracker.segment.number:
@@ -240,7 +240,7 @@ class Segments:
         del self._trackers[tracker.segment.number]
 
     def _reported(self, result: TrackResult) -> TrackResult:
-        """What is reported of a segment that is not the main map: only what is final."""
+        """Reduce the result of a segment that is not the main map to what is final."""
         if self.current is self.main:
             return result
         return TrackResult(result.state, finalized_elsewhere=result.finalized)

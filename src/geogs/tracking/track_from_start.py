@@ -1,4 +1,4 @@
-"""Frames from before a map was started, tracked from its keyframes backwards, then forwards."""
+"""Tracking of earlier frames once a map is started: backwards, then forwards."""
 
 from typing import Any
 
@@ -15,20 +15,20 @@ from geogs.tracking.locate.localiser import visible_keyframes
 from geogs.world.keyframes import KeyframeSet
 
 MIN_SHARED = 0.5
-"""Least shared part of the cells for one structure to hold two edges (:func:`largest_part`): more
-than of a start, as its frames can do without."""
+"""Least shared fraction of the cells for a rigid connection of two edges (:func:`largest_part`):
+more than for a start, as these keyframes are dispensable."""
 
 
 def track_from_start(local: LocalMapping, locator: FrameLocator) -> None:
-    """Locate the frames that have no pose from the keyframes of a start: those before its last,
-    the latest first, then those after it.
+    """Locate the frames without pose by the keyframes of a start: those before its last keyframe,
+    latest first, then those after it.
 
-    Each is searched for where the camera was at the nearest time that is known, with the
-    orientation that relative rotations to it say; they err alike while the camera turns, and along
-    a whole turn that adds up to more than flow can bridge. Those that were keyframes of attempts
-    which failed become keyframes again by the rule by which frames do: else all would hang on a
-    keyframe that sees them at its border, and what they show would have no depth. Such as the
-    structure of the others does not hold are given up again.
+    The initial guess is the known position nearest in time, with the orientation from relative
+    rotations; their errors are correlated while the camera rotates and add up, over a full
+    rotation, to more than flow can bridge. Keyframes of failed attempts become keyframes again if
+    far enough from the others: else all these frames would depend on a keyframe that sees them at
+    its border, and parts of the scene would have no depth. Drop those that are not rigidly
+    connected.
     """
     recorder, keyframes = local.map.recorder, local.keyframes
     waiting = recorder.unplaced()
@@ -36,7 +36,7 @@ def track_from_start(local: LocalMapping, locator: FrameLocator) -> None:
         return
     rotations = {r.index: r.rotations for r in recorder.log.records}
     placed = {k.frame_index: k.T_cw for k in keyframes}
-    # Of the frames on a keyframe that was given up the earliest was that keyframe.
+    # The earliest of the frames anchored to a dropped keyframe was that keyframe itself.
     given_up = {r.anchor: r for r in reversed(waiting) if r.anchor is not None}
     last, extended = max(placed), list[int]()
     for record in sorted(waiting, key=lambda r: (r.index > last, abs(r.index - last))):
@@ -73,7 +73,7 @@ def _located(
     encoded: Any,
     guess: Float64[Tensor, "4 4"],
 ) -> FrameMotion | None:
-    """A frame at the keyframe nearest in time, or at those that see most from the guess."""
+    """Locate a frame at the keyframe nearest in time, or those that share most with the guess."""
     candidates = list(keyframes)
     nearest = min(candidates, key=lambda k: abs(k.frame_index - index))
     for keyframe in dict.fromkeys((nearest, *visible_keyframes(candidates, guess))):
@@ -84,7 +84,7 @@ def _located(
 
 
 def _turned(T_cw: Float64[Tensor, "4 4"], R: Float64[Tensor, "3 3"]) -> Float64[Tensor, "4 4"]:
-    """The pose of a camera in the same place with another orientation."""
+    """Return the pose with the same camera centre and another orientation."""
     turned = T_cw.clone()
     turned[:3, :3], turned[:3, 3] = R, R @ T_cw[:3, :3].mT @ T_cw[:3, 3]
     return turned

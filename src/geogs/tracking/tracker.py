@@ -36,28 +36,28 @@ from geogs.world.segments import LastFrame, TrackState, VideoSegment
 
 @dataclass(frozen=True)
 class TrackResult:
-    """Changes by one frame."""
+    """Changes after one frame."""
 
     state: TrackState
     finalized: tuple[int, ...] = ()
-    """Ids that from now on are never removed, earliest first."""
+    """Ids that became final and will not be removed, earliest first."""
     active: tuple[int, ...] = ()
     """Ids whose poses the local adjustment still moves, earliest first."""
     finalized_elsewhere: tuple[int, ...] = ()
     """Ids that became final in a segment that is not the main map."""
     is_new_main: bool = False
-    """Whether another segment became the main map; what is final is all of it."""
+    """Whether another segment became the main map; ``finalized`` then lists all its keyframes."""
 
 
 @dataclass(frozen=True)
 class _Unfinished:
-    """A keyframe of which nothing but the pose is known, and what it was located by."""
+    """A new keyframe with a pose only, and the motion by which it was located."""
 
     keyframe: Keyframe
     motion: FrameMotion
     rotations: Sequence[RelativeRotation]
     is_last: bool
-    """Whether hardly any frame comes after it."""
+    """Whether the video ends soon after it."""
 
 
 class Tracker:
@@ -71,8 +71,8 @@ class Tracker:
         prior: MonocularPrior | None = None,
         defers: bool = False,
     ) -> None:
-        """``segment`` is what is known so far, and is changed in place. One that ``defers`` leaves
-        to :meth:`complete` what a new keyframe takes beyond its pose."""
+        """``segment`` is the state so far, changed in place. With ``defers`` new keyframes get only
+        a pose until :meth:`complete` is called."""
         self.segment, self.keyframes, self.config = segment, segment.keyframes, config.tracking
         self.map = SegmentMap(segment, operator, config, prior)
         grid = self.keyframes.grid
@@ -82,7 +82,7 @@ class Tracker:
         self._orientation = OrientationFollower(grid, operator, self.config)
         self.local = LocalMapping(self.map, self.config)
         self._motion: FrameMotion | None = None
-        """The motion by which the last frame was located; none where it was not."""
+        """Motion by which the last frame was located; None where it was not."""
         self._defers = defers
         self._unfinished: _Unfinished | None = None
 
@@ -90,7 +90,7 @@ class Tracker:
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"] | None:
-        """World to camera where the camera was last seen; none before that."""
+        """Last known pose, world to camera; None before the first."""
         last = self.segment.status.last
         return None if last is None else last.T_cw(self.keyframes[last.keyframe])
 
@@ -100,31 +100,31 @@ class Tracker:
         return self._unfinished is not None
 
     def deviation(self) -> DeviationOf | None:
-        """Computes how well the last frame's pose is known relative to the keyframes around; none
-        if it has no pose, or was placed with others at the start."""
+        """Return a function for the deviations of the last pose relative to the keyframes around;
+        None if it has no pose, or was located with others at the start."""
         motion, keyframes = self._motion, self.keyframes
         if motion is None or motion.keyframe not in keyframes:
             return None
         return deviation_of(keyframes.grid, keyframes[motion.keyframe], motion)
 
     def trajectory(self, elsewhere: Sequence[FrameRecord] = ()) -> Trajectory:
-        """Poses of all frames seen so far, solved on the present keyframes.
+        """Return the poses of all frames so far, solved on the present keyframes.
 
-        Before the map is started no more than orientations is known, and of frames ``elsewhere``,
-        in other segments, no more than that ever.
+        Before the map is started, and always for frames ``elsewhere`` in other segments, only
+        orientations are known.
         """
         has_map = self.segment.status.has_map
         return solve_trajectory(self.map.recorder.log, self.keyframes, elsewhere, has_map)
 
     def settle(self) -> None:
-        """Wait until the segment holds all that is being measured of frames by threads."""
+        """Wait until the segment includes all measurements of threads."""
         self._choice.settle()
         _ = self.map.recorder.log
 
     # --- the stream ------------------------------------------------------------------------
 
     def track(self, frame: Frame) -> TrackResult:
-        """Take the next frame.
+        """Track the next frame.
 
         Raises InputError if its size is not the camera's.
         """
@@ -150,7 +150,7 @@ class Tracker:
         return self._lose(frame, rotations)
 
     def rejoin(self, frame: Frame, recognised: Sequence[Recognition]) -> TrackResult | None:
-        """Take the next frame, which looks like some keyframes; None if it is at none of them."""
+        """Track the next frame from recognised keyframes; None if none of them locates it."""
         self.map.recorder.note_rows(frame)
         encoded = self.map.operator.encode(frame.image)
         motion = self._localiser.recognise(encoded, recognised)
@@ -160,13 +160,13 @@ class Tracker:
         return self._take(frame, encoded, motion)
 
     def cut(self) -> None:
-        """No motion links the next frame to those before it; the camera has to be found anew."""
+        """Note that no motion links the next frame: the camera has to be relocalised."""
         self.segment.status.orientation.reset()
         if self.segment.status.has_map:
             self.segment.status.lose()
 
     def finish(self) -> TrackResult:
-        """End of the stream: every keyframe becomes final.
+        """End the stream: every keyframe becomes final.
 
         Raises TrackingLost if the map could never be started.
         """
@@ -182,7 +182,7 @@ class Tracker:
     def absorb(self, other: "Tracker") -> None:
         """Take over the keyframes and frames of another tracker, already in this one's gauge.
 
-        The camera is where the later of the two saw it last. The other is of no more use.
+        The camera's state is that of the later of the two. The other must not be used again.
         """
         own, theirs = self.segment, other.segment
         ids, guests = own.keyframes.ids, theirs.keyframes.ids
@@ -198,7 +198,7 @@ class Tracker:
     # --- frames that come while a keyframe is being completed ---------------------------------
 
     def follower(self) -> Follower:
-        """What locates the frames that come while another thread completes the keyframe."""
+        """Return a locator of frames for while another thread completes the keyframe."""
         new, last = self._unfinished, self.segment.status.last
         assert new is not None, "no keyframe waits to be completed"
         assert last is not None
@@ -220,7 +220,7 @@ class Tracker:
         self._motion = None  # by which a frame was located at what the keyframe was
 
     def complete(self) -> TrackResult:
-        """Do what the new keyframe takes beyond its pose: neighbours, depth, local adjustment."""
+        """Complete the new keyframe: neighbours, depth, local adjustment."""
         new, self._unfinished = self._unfinished, None
         assert new is not None, "no keyframe waits to be completed"
         culls = not new.is_last
@@ -241,7 +241,7 @@ class Tracker:
             )
 
     def _initialise(self, frame: Frame, encoded: Any) -> TrackResult:
-        """Take a frame while there is no map, which may start it."""
+        """Process a frame while there is no map; it may start the map."""
         status, keyframes, rotations = self.segment.status, self.keyframes, []
         if not len(keyframes):
             followed = self._orientation.follow(status.orientation, frame, encoded)
@@ -255,7 +255,7 @@ class Tracker:
         return TrackResult(status.state, fresh, self.local.active)
 
     def _begin(self) -> None:
-        """The map has just been started."""
+        """Initialise tracking right after the map was started."""
         self.map.odometry.update_scale()
         keyframes = self.keyframes
         track_from_start(self.local, self._localiser.locator)
@@ -267,7 +267,7 @@ class Tracker:
             status.misses = status.frames_lost = len(after)
 
     def _lose(self, frame: Frame, rotations: Sequence[RelativeRotation] = ()) -> TrackResult:
-        """The frame has no pose; no orientation, either, unless rotations say one."""
+        """Log a frame without a pose, with an orientation only if there are ``rotations``."""
         status = self.segment.status
         if status.has_map:
             status.lose()
@@ -283,7 +283,7 @@ class Tracker:
         motion: FrameMotion,
         rotations: Sequence[RelativeRotation] = (),
     ) -> TrackResult:
-        """The frame has been located: make it a keyframe where it is one, else log it."""
+        """Log a located frame, or make it a keyframe if needed."""
         status, self._motion = self.segment.status, motion
         anchor, last = self.keyframes[motion.keyframe], self._located(frame, motion)
         if status.state is TrackState.LOST:
@@ -291,7 +291,7 @@ class Tracker:
         status.state, status.misses, status.frames_lost = TrackState.TRACKING, 0, 0
         status.last = last
         self._orientation.located(status.orientation, frame, encoded)
-        # Where few frames were measured, each of these is worth a keyframe.
+        # Where few frames have sensor depth, each of them is worth a keyframe.
         is_first_measured = (
             frame.depth is not None and self.segment.is_metric and anchor.measured is None
         )
@@ -306,7 +306,7 @@ class Tracker:
         return TrackResult(status.state) if self._defers else self.complete()
 
     def _located(self, frame: Frame, motion: FrameMotion) -> LastFrame:
-        """Where the frame is, and how the camera has moved since the one before."""
+        """Return the pose of the frame, and the motion since the frame before."""
         status, anchor, T_before = self.segment.status, self.keyframes[motion.keyframe], self.T_cw
         velocity, interval, before = None, 0.0, status.last
         is_tracking = status.state is TrackState.TRACKING
@@ -325,7 +325,7 @@ def lone_tracker(
     prior: MonocularPrior | None = None,
     defers: bool = False,
 ) -> Tracker:
-    """A tracker of a video that is one segment, without loops and without a map of disks."""
+    """Return a tracker of a video with one segment, without loops and without a map of disks."""
     grid, config = SampleGrid(camera, device), config or Config()
     operator = operator or build_operator(config.tracking, grid)
     segment = VideoSegment(keyframes=KeyframeTable.on(grid, operator.encode).new_set())

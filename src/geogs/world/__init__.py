@@ -1,1 +1,1 @@
-"""Keyframes: where they were taken, what they saw, and how much of it is in memory."""
+"""All persistent state: keyframes, edges, frames, loops and the map, in memory and on disk."""

@@ -1,7 +1,7 @@
-"""Arrays that leave the memory for a file until they are wanted again.
+"""Arrays that are moved from memory to a file and read back when needed.
 
-A long video has more keyframes than fit into memory, and seldom are old ones looked at. The file
-is read and written at offsets and never mapped, so nothing of it counts as memory of the process.
+The keyframes of a long video do not fit into memory, and old ones are rarely used. The file is
+read and written at offsets and never mapped, so it does not count as memory of the process.
 """
 
 import math
@@ -28,14 +28,13 @@ _PIECE = 1 << 24
 class Archive:
     """A file of arrays of any shape and type, for as long as the process lasts.
 
-    It lies in ``folder``, or where the system keeps temporary files (``TMPDIR``), has no name there
-    and so vanishes with the process, however that ends. Space of arrays that nobody refers to any
-    more is used again.
+    It lies in ``folder``, or in the system's temporary folder (``TMPDIR``). It has no name there
+    and so vanishes with the process, however that ends. Space of unreferenced arrays is reused.
 
-    For a checkpoint the file gets a name (``settle``), and what the last checkpoint refers to stays
-    until the next one is complete (``release``). Every array has a checksum from when it was
-    written, which is compared when a checkpoint is read: so a checkpoint costs what is new in it,
-    and damage is found before any work is done with it.
+    For a checkpoint the file gets a name (``settle``), and arrays of the last checkpoint stay until
+    the next one is complete (``release``). Every array gets a checksum when it is written, which is
+    compared when a checkpoint is read. So a checkpoint only costs its new arrays, and damage is
+    found before any work is done with it.
     """
 
     def __init__(self, folder: Path | str | None = None) -> None:
@@ -45,14 +44,14 @@ class Archive:
         self._free: dict[int, list[int]] = {}
         """Offsets of unused pieces, by their size."""
         self._gone: deque[tuple[int, int]] = deque()
-        """Offset and size of what nobody refers to any more; collected without a lock."""
+        """Offset and size of unreferenced arrays; collected without a lock."""
         self._end = 0
         self._lock = threading.Lock()
         self._is_settled = False
         self._withheld: list[tuple[int, int]] = []
-        """Offset and size of what is gone, but not for the last checkpoint."""
+        """Offset and size of unreferenced arrays that the last checkpoint still needs."""
         self._releasing: list[tuple[int, int]] = []
-        """The same of what is gone for the checkpoint that is being written, too."""
+        """Those that the checkpoint being written does not need, either."""
         try:
             self._file = tempfile.TemporaryFile(dir=self.folder, buffering=0)  # noqa: SIM115
         except OSError as error:
@@ -75,7 +74,7 @@ class Archive:
         return archived
 
     def read(self, archived: "Archived") -> np.ndarray:
-        """An array as it was written.
+        """Read an array back.
 
         Raises OutputError if the file has been cut off.
         """
@@ -91,7 +90,7 @@ class Archive:
     # --- checkpoints -----------------------------------------------------------------------
 
     def settle(self, folder: "NamedFiles") -> "SettledArchive":
-        """Put all that was written on the disk under its name in a folder; what to open it by.
+        """Flush the file to disk under its name in a folder; return what is needed to reopen it.
 
         Raises OutputError if the disk is full, or cannot be written.
         """
@@ -108,16 +107,16 @@ class Archive:
         return SettledArchive(self._end, [*unused, *self._releasing])
 
     def release(self) -> None:
-        """The checkpoint that was written since ``settle`` is complete and replaces the last."""
+        """Note that the checkpoint written since ``settle`` is complete and replaces the last."""
         for offset, size in self._releasing:
             self._free.setdefault(size, []).append(offset)
         self._releasing = []
 
     @classmethod
     def reopened(cls, folder: "NamedFiles", name: str, settled: "SettledArchive") -> "Archive":
-        """The archive as it was when it was settled; what was written later is cut off.
+        """Reopen the archive as it was when settled; later data is cut off.
 
-        Raises InputError if the file is missing, too short, or what is said of it cannot be.
+        Raises InputError if the file is missing or too short, or its description is invalid.
         """
         parts = [(0, settled.end), *settled.free]
         if any(min(p) < 0 or sum(p) > settled.end for p in parts):
@@ -136,7 +135,7 @@ class Archive:
     def piece(
         self, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
     ) -> "Archived":
-        """An array that a checkpoint says is in the file; it is read to be sure.
+        """Return an array that a checkpoint refers to, after reading it to check it.
 
         Raises InputError if it is not there, or has changed.
         """
@@ -148,7 +147,7 @@ class Archive:
         return archived
 
     def _move(self, folder: "NamedFiles") -> None:
-        """Copy the file to another place, where it is from then on."""
+        """Move the file into another folder."""
         with folder.create(self.name) as named:
             done = 0
             while done < self._end:
@@ -163,7 +162,7 @@ class Archive:
     def _archived(
         self, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
     ) -> "Archived":
-        """A reference to an array; its space is used again once nobody has one any more."""
+        """Return a reference to an array; its space is reused once no reference is left."""
         archived = Archived(self, offset, shape, dtype, checksum)
         size = math.prod(shape) * dtype.itemsize
         weakref.finalize(archived, self._gone.append, (offset, size))
@@ -181,7 +180,7 @@ class Archive:
             raise self._unwritable(error) from error
 
     def _collect(self) -> None:
-        """Make the space of arrays that are gone free for others."""
+        """Free the space of unreferenced arrays."""
         while self._gone:
             offset, size = self._gone.popleft()
             if self._is_settled:
@@ -190,7 +189,7 @@ class Archive:
                 self._free.setdefault(size, []).append(offset)
 
     def _unwritable(self, error: OSError, settled: Path | None = None) -> OutputError:
-        """The error of this file, or of the one that it becomes in a folder where it is settled."""
+        """Return the error for this file, or for the settled file in a folder."""
         settled = settled or (self.folder if self._is_settled else None)
         remedy = (
             "name a folder on a larger disk in TMPDIR" if settled is None
@@ -204,7 +203,7 @@ class Archive:
 
 @dataclass(frozen=True)
 class SettledArchive:
-    """What a checkpoint says of an archive."""
+    """Description of an archive in a checkpoint."""
 
     end: int
     """Bytes of the file."""
@@ -217,18 +216,18 @@ class NamedFiles(Protocol):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the folder."""
         ...
 
     def create(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """A new file for reading and writing, which is gone again after an error.
+        """Create a file for reading and writing; it is removed again after an error.
 
         Raises OSError if there is one of that name.
         """
         ...
 
     def change(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """A file for reading and writing. Raises InputError if there is none."""
+        """Open a file for reading and writing. Raises InputError if there is none."""
         ...
 
 
@@ -248,10 +247,10 @@ class Archived:
         """CRC-32 of its bytes."""
 
     def load(self) -> np.ndarray:
-        """The array as it was archived."""
+        """Read the array."""
         return self.archive.read(self)
 
 
 def _bytes(array: np.ndarray) -> memoryview:
-    """The bytes of an array that lies row by row."""
+    """Bytes of a C-contiguous array."""
     return memoryview(array.reshape(-1).view(np.uint8).data)

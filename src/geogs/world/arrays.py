@@ -1,4 +1,4 @@
-"""One table of all that is as large as an image: by name and keyframe, on disk and in memory."""
+"""One table of all image-sized arrays, by name and keyframe, on disk and in memory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,18 +12,18 @@ from geogs.world.lru import LruCache
 V = TypeVar("V")
 
 NOT_STORED = {"stored": False}
-"""Metadata of a field that belongs to the process and is left out of checkpoints."""
+"""Metadata of a field that is left out of checkpoints."""
 RESIDENT = 128
-"""Keyframes whose large arrays stay in memory, where nobody says otherwise."""
+"""Default number of keyframes whose large arrays stay in memory."""
 
 
 @dataclass(eq=False)
 class ArrayTable:
-    """Large arrays by name and keyframe id; the file has all, the memory those used last.
+    """Large arrays by name and keyframe id: all in the file, those used last also in memory.
 
-    Arrays that are put are written at once; those put as ``recent`` stay in memory as well, until
-    so many others of the name have been used since. What can be made again is kept beside them and
-    never written. For any thread.
+    Arrays are written at once; those put as ``recent`` also stay in memory until ``resident``
+    others of that name have been used. Values that can be recomputed are cached with them and never
+    written. Thread-safe.
     """
 
     archive: Archive = field(default_factory=Archive)
@@ -48,7 +48,7 @@ class ArrayTable:
         return id in self.pieces.get(name, ())
 
     def get(self, name: str, id: int, recent: bool = False) -> np.ndarray | None:
-        """An array as it was put, not to be changed; None without. It stays in memory if recent."""
+        """Return an array, not to be changed, or None. It stays in memory if recent."""
         piece = self.pieces.get(name, {}).get(id)
         if piece is None or not recent:
             return None if piece is None else piece.load()
@@ -56,11 +56,11 @@ class ArrayTable:
         return array
 
     def load(self, name: str, id: int) -> np.ndarray:
-        """An array that there must be, as it was put."""
+        """Return an array that must exist."""
         return self.pieces[name][id].load()
 
     def made(self, name: str, id: int, make: Callable[[], V]) -> V:
-        """A value that can be made again, and is where it is not among those used last."""
+        """Return a cached value, or compute it again."""
         value: V = self.recent(name).get(id, make)
         return value
 
@@ -71,10 +71,10 @@ class ArrayTable:
             self._recent[name].drop(id)
 
     def forget(self, id: int) -> None:
-        """Forget all that there is of a keyframe."""
+        """Forget all arrays of a keyframe."""
         for name in {*self.pieces, *self._recent}:
             self.drop(name, id)
 
     def recent(self, name: str, limit: int | None = None) -> LruCache[int, Any]:
-        """Values of a name in memory; as many as are resident, or another ``limit``."""
+        """Return the values of a name in memory, at most ``limit`` (default: ``resident``)."""
         return self._recent.setdefault(name, LruCache(limit or self.resident))

@@ -1,4 +1,4 @@
-"""The map: geometry-only Gaussian disks and what is remembered about each of them."""
+"""The map: geometry-only Gaussian disks and their training state."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -36,11 +36,11 @@ class DiskParameters(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class GaussianMap:
-    """Disks, what is remembered of each, and the moments of the optimiser that trains them.
+    """Disks, their counters, and the moments of the optimiser that trains them.
 
     The parameters are leaf tensors that require gradients. All tensors are the first rows of larger
-    ones (``room``), which stay where they are until more disks come than there is room for; so they
-    are others whenever disks come or go.
+    ones (``room``), which are only reallocated when they are full. So the tensors are replaced
+    whenever disks are added or removed.
     """
 
     parameters: DiskParameters
@@ -92,7 +92,7 @@ class GaussianMap:
 
     @property
     def device(self) -> torch.device:
-        """Where the disks live."""
+        """Device of the disks."""
         return self.position.device
 
     @property
@@ -102,17 +102,17 @@ class GaussianMap:
 
     @property
     def opacity(self) -> Float[Tensor, "n"]:
-        """In (0, 1), detached."""
+        """Opacities in (0, 1), detached."""
         return self.parameters.opacity_logit.detach().sigmoid()
 
     @property
     def capacity(self) -> int:
-        """Disks there is room for; it changes whenever the tensors have moved."""
+        """Number of disks there is room for; it changes whenever the tensors are reallocated."""
         return len(self._trained[0].room)
 
     @property
     def room(self) -> DiskParameters:
-        """The trained tensors with all their room; rows beyond the disks mean nothing."""
+        """The trained tensors with all their room; rows beyond the disks are unused."""
         return DiskParameters(*(rows.room for rows in self._trained))
 
     def training_room(self) -> list[Tensor]:
@@ -136,11 +136,11 @@ class GaussianMap:
         self._expose()
 
     def keep(self, mask: Bool[Tensor, "n"]) -> None:
-        """Drop the disks where ``mask`` is false; gradients are dropped with any."""
+        """Remove the disks where ``mask`` is false; if any is removed, gradients are dropped."""
         index = mask.nonzero()[:, 0]
         if len(index) == len(self):
             return
-        # Old disks come first and seldom go, so most rows of a large map need not be touched.
+        # Old disks come first and are rarely removed: most rows of a large map stay untouched.
         start = int(mask.to(torch.uint8).argmin())
         for rows in (*self._trained, *self._moments, *self._counts):
             rows.take(index, start)
@@ -148,7 +148,7 @@ class GaussianMap:
 
     @torch.no_grad()
     def excerpt(self, index: Int[Tensor, "m"]) -> "GaussianMap":
-        """A map of some of the disks: copies, which :meth:`take_back` returns."""
+        """Copy some of the disks into a map of their own; :meth:`take_back` writes them back."""
 
         def some(group: DiskParameters) -> DiskParameters:
             return DiskParameters(*(part.detach()[index] for part in group))
@@ -160,7 +160,7 @@ class GaussianMap:
 
     @torch.no_grad()
     def take_back(self, index: Int[Tensor, "m"], part: "GaussianMap") -> None:
-        """What has become of the disks of an excerpt, none of which came or went."""
+        """Write back the disks of an excerpt, to which none were added or removed."""
         own = (*self.parameters, *self.first, *self.second, self.steps, self.seen)
         theirs = (*part.parameters, *part.first, *part.second, part.steps, part.seen)
         for mine, other in zip(own, theirs, strict=True):
@@ -207,7 +207,7 @@ class GaussianMap:
         )
 
     def _expose(self) -> None:
-        """Fresh leaf tensors over the present rows, without gradients."""
+        """Make new leaf tensors over the present rows, without gradients."""
         fresh = (rows.rows.detach().requires_grad_() for rows in self._trained)
         self.parameters = DiskParameters(*fresh)
         self.first = DiskParameters(*(rows.rows for rows in self._moments[:4]))

@@ -1,4 +1,4 @@
-"""Edges between keyframes: the flow measured from one to another, in full or packed.
+"""Edges between keyframes: measured optical flow, in full precision or packed.
 
 A packed edge takes a third of the memory, for graphs over thousands of keyframes.
 """
@@ -33,11 +33,11 @@ class MeasuredEdge:
     weight: Annotated[Float32[Tensor, "p 2"], Range(0)]
     """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
     reprojection: Float32[Tensor, "p 2"]
-    """Where the cells fell when the flow was measured."""
+    """Projections of the cells by the poses and depths when the flow was measured."""
     damping: Annotated[Float32[Tensor, "p"], Range(0)] | None = None
-    """Damping of the source's inverse depth, if the operator gives one."""
+    """Damping of the source's inverse depth, if the flow operator gives one."""
     memory: Any = field(default=None, metadata=NOT_STORED)
-    """What the operator keeps of this edge, and can do without."""
+    """Optional cache of the flow operator for this edge."""
 
 
 @dataclass(eq=False)
@@ -45,9 +45,9 @@ class PackedEdge:
     """One direction of a measured pair, packed.
 
     Positions are kept in steps of 2^-15 of the long edge (1/64 pixel at 512; matches half an image
-    outside are clamped to its border) and weights in half precision. Where the cells fell when the
-    flow was measured is computed again from the poses and depths of that time, which many edges
-    share.
+    outside are clamped to its border) and weights in half precision. The projections of the cells
+    when the flow was measured are recomputed from the poses and depths of that time, which many
+    edges share.
     """
 
     position: Int16[Tensor, "p 2"]
@@ -56,14 +56,14 @@ class PackedEdge:
     """World to camera of the source when the flow was measured."""
     T_target: Pose
     inverse_depth: Annotated[Float32[Tensor, "p"], POSITIVE]
-    """The source's when the flow was measured."""
+    """Inverse depth of the source when the flow was measured."""
     damping: Annotated[Float32[Tensor, "p"], Range(0)] | None = None
-    """Damping of the source's inverse depth, if the operator gives one."""
+    """Damping of the source's inverse depth, if the flow operator gives one."""
     memory: Any = field(default=None, metadata=NOT_STORED)
-    """What the operator keeps of this edge, and can do without."""
+    """Optional cache of the flow operator for this edge."""
 
     def moved(self, camera: Camera, shift: Float[Tensor, "p 2"]) -> "PackedEdge":
-        """With its matches so many pixels elsewhere."""
+        """Return a copy with its matches shifted by so many pixels."""
         return replace(self, position=self.position + in_steps(camera, shift))
 
 
@@ -73,7 +73,7 @@ Edge = MeasuredEdge | PackedEdge
 def edge_matches(
     grid: SampleGrid, edges: Sequence[Edge]
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-    """Measured positions and weights of some edges."""
+    """Return the measured positions and weights of some edges."""
     packed = [e for e in edges if isinstance(e, PackedEdge)]
     if packed and len(packed) == len(edges):
         position = torch.stack([e.position for e in packed])
@@ -91,22 +91,22 @@ def edge_matches(
 def pack_matches(
     grid: SampleGrid, pixels: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"]
 ) -> tuple[Int16[Tensor, "*b 2"], Float16[Tensor, "*b 2"]]:
-    """Positions in whole steps from the image's centre, zero where unmatched; half weights."""
+    """Pack positions in whole steps from the image's centre, zero where unmatched, and weights."""
     steps = (pixels - grid.centre) / position_step(grid.camera)
     position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
     return position, weight.clamp(max=MAX_WEIGHT).half()
 
 
 def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-    """Pixels of packed positions; the image's centre where unmatched."""
+    """Return packed positions in pixels; the image's centre where unmatched."""
     return position.float() * position_step(grid.camera) + grid.centre
 
 
 def position_step(camera: Camera) -> float:
-    """Pixels between two packed positions that differ by one."""
+    """Return the step of packed positions in pixels."""
     return 2.0**-15 * camera.long_edge
 
 
 def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 2"]:
-    """Pixels by which positions are moved, in whole steps."""
+    """Convert a shift in pixels to whole steps."""
     return (shift / position_step(camera)).round().short()

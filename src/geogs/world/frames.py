@@ -1,4 +1,4 @@
-"""Frames of a video: what is kept of each to place it once the keyframes around it are final."""
+"""Records of video frames, from which each is located once the keyframes around it are final."""
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
@@ -19,9 +19,9 @@ class RelativeRotation:
     """Rotation of a frame's camera relative to that of an earlier frame."""
 
     frame: Number
-    """Index of the earlier."""
+    """Index of the earlier frame."""
     R: Annotated[Float64[Tensor, "3 3"], RIGID]
-    """The earlier camera to this one."""
+    """Rotation from the earlier camera to this one."""
     deviation: AtLeast0
     """Standard deviation of the angle, radians."""
 
@@ -34,23 +34,23 @@ class Observation:
     position: Int16[Tensor, "s 2"]
     half_weight: Annotated[Float16[Tensor, "s 2"], Range(0)]
     shift: Int16[Tensor, "s 2"] | None = None
-    """Steps to be added to the position, for the rows of a rolling shutter."""
+    """Rolling-shutter correction of the position, in steps."""
     lens_shift: Int16[Tensor, "s 2"] | None = None
-    """And for what the lenses of frames have of their own."""
+    """Correction for per-frame intrinsics, in steps."""
 
     @property
     def of_one_lens(self) -> Int16[Tensor, "s 2"]:
-        """The position as if the lens of all had seen it."""
+        """Position corrected for per-frame intrinsics."""
         return self.position if self.lens_shift is None else self.position + self.lens_shift
 
     @property
     def of_one_time(self) -> Int16[Tensor, "s 2"]:
-        """The position as if all rows had been seen at once."""
+        """Position corrected for the rolling shutter."""
         return self.position if self.shift is None else self.position + self.shift
 
     @property
     def shifted(self) -> Int16[Tensor, "s 2"]:
-        """The position with both shifts."""
+        """Position with both corrections."""
         return self.of_one_time + (self.of_one_lens - self.position)
 
 
@@ -63,29 +63,29 @@ class FrameRecord:
     anchor: KeyframeId | None
     """Keyframe that the pose is relative to; None where the frame was not tracked."""
     T_rel: Pose
-    """Anchor keyframe to this frame."""
+    """Transform from the anchor keyframe to this frame."""
     scale: Positive = 1.0
-    """Scale of the anchor when that was measured."""
+    """Scale of the anchor when ``T_rel`` was measured."""
     observations: list[Observation] = field(default_factory=list)
     rotations: list[RelativeRotation] = field(default_factory=list)
-    """Relative to earlier frames: what is left to go by where there is no depth."""
+    """Rotations relative to earlier frames, for frames that see no known depth."""
     image: UInt8[np.ndarray, "h w 3"] | None = None
-    """Kept until the keyframes around are final and the flow from them is measured."""
+    """Kept until the keyframes around it are final and the flow from them is measured."""
     encoded: Any = field(default=None, metadata=NOT_STORED)
-    """The flow operator's form of the image, or None where it has to be computed again."""
+    """The image encoded by the flow operator; None where it has to be computed again."""
     is_found: bool = False
-    """Whether it was lost, and placed after the stream by frames that were not."""
+    """Whether it was lost during the stream and relocalised afterwards."""
 
     def observes(self, keyframe: int) -> bool:
         """Whether the flow from that keyframe has been measured."""
         return any(o.keyframe == keyframe for o in self.observations)
 
     def T_cw(self, anchor: Keyframe) -> Float[Tensor, "4 4"]:
-        """World to camera by the present pose and scale of its anchor."""
+        """Return world to camera by the present pose and scale of its anchor."""
         return anchor.at_present_scale(self.T_rel, self.scale) @ anchor.T_cw
 
     def forget_image(self) -> None:
-        """Free the image, once nothing is left to be measured in it."""
+        """Free the image, once it is no longer needed."""
         self.image = self.encoded = None
 
 
@@ -97,12 +97,12 @@ class FrameLog:
     rows: dict[Number, SeenRows] = field(default_factory=dict)
     """Rectified rows of a rolling shutter, by the indices of the frames."""
     open_rows: SeenRows | None = None
-    """Rows of every frame where none are rectified, and nobody knows whether they should be."""
+    """Rows of every frame where none are rectified and the shutter is unknown."""
     lenses: dict[Number, FrameLens] = field(default_factory=dict)
-    """What lenses of frames have of their own, where it moves on while rows are read; likewise."""
+    """Per-frame intrinsics that change during readout, by the indices of the frames."""
 
     def set_readout(self, factor: float, doubt: float) -> None:
-        """Have rows seen over a readout that is so many times what they were rectified by, with its
-        standard error as a part of it."""
+        """Scale the readout of all rectified rows by ``factor``; ``doubt`` is its relative standard
+        error."""
         for index, rows in self.rows.items():
             self.rows[index] = replace(rows, seconds=factor * rows.seconds, doubt=doubt)

@@ -30,7 +30,7 @@ class SampleGrid:
     pixels: Float[Tensor, "p 2"] = field(init=False)
     """x, y of each cell, float32."""
     rays: Float[Tensor, "p 3"] = field(init=False)
-    """What each cell sees at depth 1, float32."""
+    """Viewing ray of each cell, to depth 1, float32."""
     centre: Float[Tensor, "2"] = field(init=False)
     """Half of the image's width and height, float32."""
 
@@ -54,8 +54,8 @@ class SampleGrid:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """What letters in the shapes of stored arrays stand for: ``p`` cells, ``s`` of them in
-        every second row and column, images of ``h w`` pixels, rectified by ``r c`` nodes."""
+        """Sizes by the letters in the shapes of stored arrays: ``p`` cells, ``s`` cells in every
+        second row and column, images of ``h w`` pixels, rectified by ``r c`` nodes."""
         camera = self.camera
         size = {"p": self.size, "h": camera.height, "w": camera.width}
         some = -(-self.height // 2) * -(-self.width // 2)
@@ -63,7 +63,7 @@ class SampleGrid:
 
     @property
     def on_gpu(self) -> bool:
-        """Whether fields on the grid are kept and worked on by a GPU."""
+        """Whether fields on the grid are on a GPU."""
         return torch.device(self.device).type == "cuda"
 
     @property
@@ -80,7 +80,7 @@ class SampleGrid:
     def sample_field(
         self, values: Float[Tensor, "p c"], points: Float[Tensor, "n 2"]
     ) -> Float[Tensor, "n c"]:
-        """Bilinear value of a field given on the grid at any pixels; replicated at the border."""
+        """Interpolate a field on the grid bilinearly at any pixels; replicated at the border."""
         cells, sides = (points - OFFSET) / STRIDE, (self.width - 1, self.height - 1)
         normalised = torch.stack([cells[:, k] * (2 / sides[k]) - 1 for k in (0, 1)], -1)
         image = values.mT.reshape(1, -1, self.height, self.width)
@@ -90,14 +90,14 @@ class SampleGrid:
         return out[0, :, 0].mT
 
     def cells_of(self, points: Float[Tensor, "*b 2"]) -> tuple[Tensor, Bool[Tensor, "*b"]]:
-        """Index of the cell nearest to each pixel position, and whether there is one."""
+        """Return the index of the cell nearest to each pixel position, and whether there is one."""
         cell = torch.round((points.nan_to_num(-1e4).clamp(-1e4, 1e5) - OFFSET) / STRIDE).long()
         c, r = cell.unbind(-1)
         valid = (c >= 0) & (c < self.width) & (r >= 0) & (r < self.height)
         return torch.where(valid, r * self.width + c, torch.zeros_like(c)), valid
 
     def enlarged(self, values: Shaped[Tensor, "p"], width: int, height: int) -> Tensor:
-        """A field as an image of another size of the whole view: that of the nearest cell."""
+        """Resize a field to an image of the whole view; each pixel gets its nearest cell."""
         rows, columns = (
             to_device(_nearest(size, whole, cells), values.device)
             for size, whole, cells in (
@@ -109,6 +109,6 @@ class SampleGrid:
 
 
 def _nearest(size: int, whole: int, cells: int) -> Int[Tensor, "n"]:
-    """Index of the cell nearest to each of so many pixels along the whole of an axis."""
+    """Return the index of the cell nearest to each of ``size`` pixels along an axis."""
     position = (torch.arange(size) + 0.5) * (whole / size) - 0.5
     return torch.round((position - OFFSET) / STRIDE).long().clamp(0, cells - 1)

@@ -7,7 +7,7 @@ _LEAST = 4096
 
 
 class GrowingRows:
-    """Rows in a larger tensor, so that adding some seldom allocates and keeps addresses.
+    """Rows in a larger tensor, so that appending rarely allocates and addresses stay valid.
 
     ``room`` is all of it, ``rows`` the part in use; both share memory.
     """
@@ -25,7 +25,7 @@ class GrowingRows:
         return self.room[: self._count]
 
     def append(self, rows: Shaped[Tensor, "m *k"]) -> None:
-        """Add rows behind the present ones; the room doubles where it is too small."""
+        """Append rows; the room doubles where it is too small."""
         count = self._count + len(rows)
         if count > len(self.room):
             self.reserve(max(count, 2 * len(self.room), _LEAST))
@@ -33,13 +33,13 @@ class GrowingRows:
         self._count = count
 
     def reserve(self, size: int) -> None:
-        """Make room for so many rows in all; new room is zero."""
+        """Make room for ``size`` rows in total; new room is zero."""
         if size > len(self.room):
             room = self.room.new_zeros(size, *self.room.shape[1:])
             room[: self._count] = self.rows
             self.room = room
 
     def take(self, index: Int[Tensor, "m"], start: int = 0) -> None:
-        """Keep the rows of the index, in its order; the first ``start`` of them stay in place."""
+        """Keep the rows in ``index``, in its order; the first ``start`` of them are in place."""
         self.room[start : len(index)] = self.room[index[start:]]
         self._count = len(index)

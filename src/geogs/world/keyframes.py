@@ -1,4 +1,4 @@
-"""All keyframes of a run, by stable id: what was seen, from where, and how far it is."""
+"""All keyframes of a run, by stable id: images, poses and depths."""
 
 import copy
 import functools
@@ -33,48 +33,48 @@ KEYFRAME_ARRAYS = {
     "prior normal": Float16[np.ndarray, "h w 3"],
     "sensor depth": Annotated[Float16[np.ndarray, "h w"], UNBOUNDED, Range(0)],
 }
-"""The large arrays that a keyframe may have."""
+"""Large arrays of a keyframe, all optional."""
 
 KNOWN = 0.3
-"""Relative deviation up to which a depth helps to tell where a camera is."""
+"""Relative deviation up to which a depth is used to locate a camera."""
 RELATIVE_FLOOR = 0.004
-"""Relative depth deviation that no amount of matches removes."""
+"""Relative depth deviation that remains however many matches there are."""
 
 
 @dataclass(eq=False)
 class Keyframe:
     """The one record of a keyframe's depth and scale; its pose and its images are in its table.
 
-    A pose or a field is replaced, never changed in place: who keeps a reference sees what it was.
+    A pose or a field is replaced, never changed in place: old references keep their old value.
     """
 
     id: Id
-    """Stable: never another frame's, increasing in time."""
+    """Stable and unique, increasing in time."""
     frame_index: Number
     timestamp: float
     """Seconds."""
     inverse_depth: Annotated[Float32[Tensor, "p"], POSITIVE]
-    """On the grid of its table."""
+    """Inverse depth on the grid of its table."""
     information: Annotated[Float32[Tensor, "p"], Range(0)]
-    """Sum over matches of w |dp/dd|^2, and what a depth sensor adds; not a prior."""
+    """Sum over matches of w |dp/dd|^2, plus that of a depth sensor; without a prior's."""
     prior: KeyframePrior | None = None
     scale: Positive = 1.0
-    """Factor by which corrections have multiplied the lengths around it; what was measured from it
-    at another scale is to be multiplied by the ratio of the two."""
+    """Factor by which corrections have multiplied the lengths around it; lengths measured from it
+    at another scale have to be multiplied by the ratio of the two."""
     moving: Bool[Tensor, "p"] | None = None
-    """Cells that show something dynamic; none where nothing does, or nobody has judged yet."""
+    """Cells that show something dynamic; None where none do, or before this was tested."""
     measured: MeasuredCells | None = None
-    """What a depth sensor says; none without, or where the map is not metric."""
+    """Depth of a sensor; None without, or where the map is not metric."""
     pose: MeasuredPose | None = None
-    """Pose by another tracker, in its own world; none where there is none."""
+    """Pose by another tracker, in its own world, if any."""
     table: "KeyframeTable" = field(init=False, repr=False, metadata=NOT_STORED)
-    """Which has it; given by the table."""
+    """Table of this keyframe, set by the table."""
     own_encoded: Any = field(default=None, repr=False, metadata=NOT_STORED)
-    """The encoded image, where the table cannot make it again."""
+    """The encoded image, where the table cannot encode it again."""
 
     @property
     def grid(self) -> SampleGrid:
-        """Where depth is kept."""
+        """Sample grid of the depth."""
         return self.table.grid
 
     @property
@@ -103,8 +103,8 @@ class Keyframe:
 
     @property
     def prior_normal(self) -> Float[Tensor, "h w 3"] | None:
-        """A monocular prior's unit normals at working resolution, in the camera frame and facing
-        the camera; zero where unknown, None where nothing was asked."""
+        """Unit normals of a monocular prior at working resolution, in the camera frame and facing
+        the camera; zero where unknown, None without a prior."""
         normal = self.table.arrays.get("prior normal", self.id)
         return None if normal is None else torch.from_numpy(normal)
 
@@ -114,24 +114,24 @@ class Keyframe:
 
     @property
     def sensor_depth(self) -> Float32[np.ndarray, "h w"] | None:
-        """What a depth sensor saw, metres at working resolution, 0 where unknown; None without."""
+        """Sensor depth in metres at working resolution, 0 where unknown; None without."""
         depth = self.table.arrays.get("sensor depth", self.id)
         return None if depth is None else depth.astype(np.float32)
 
     @sensor_depth.setter
     def sensor_depth(self, metres: Float32[np.ndarray, "h w"]) -> None:
-        # Half precision rounds by 0.05 %, a tenth of what a sensor errs.
+        # Half precision rounds by 0.05 %, a tenth of a sensor's error.
         self.table.arrays.put("sensor depth", self.id, metres.astype(np.float16))
 
     def copied_to(self, table: "KeyframeTable") -> "Keyframe":
-        """A snapshot for another table, without the pose."""
+        """Copy it for another table, without the pose."""
         twin = copy.copy(self)
         twin.prior, twin.measured = copy.copy(self.prior), copy.copy(self.measured)
         twin.table = table
         return twin
 
     def as_it_is(self) -> "Keyframe":
-        """A snapshot with its pose, in a table of its own."""
+        """Copy it with its pose, into a table of its own."""
         twin = self.copied_to(self.table.mirror())
         twin.T_cw = self.T_cw
         return twin
@@ -149,23 +149,23 @@ class Keyframe:
             self.measured.rescale(factor)
 
     def at_present_scale(self, T: Float[Tensor, "4 4"], scale: float) -> Float[Tensor, "4 4"]:
-        """A motion measured from here when the keyframe had that scale, in its lengths of now."""
+        """Convert a motion measured from here at an earlier ``scale`` to the present scale."""
         factor = self.scale / scale
         return T if factor == 1.0 else scaled(T, factor)
 
     @property
     def has_known_depth(self) -> Bool[Tensor, "p"]:
-        """Where matches tell the depth to ``KNOWN``, if the poses are right."""
+        """Cells whose relative depth deviation is below ``KNOWN``, if the poses are right."""
         return KNOWN**2 * self.inverse_depth.square() * self.information > 1
 
     @property
     def confident_information(self) -> Float[Tensor, "p"]:
-        """Information less the error that no match removes: what others may trust depth by.
+        """Information of inverse depth for other stages, limited by the error no match removes.
 
-        The relative deviation of depth is z / sqrt of this. What a prior adds counts only where
+        The relative deviation of depth is z / sqrt of this. A prior's information counts only where
         depth has been adjusted with it.
         """
-        # What matches agree on is still wrong by a common error of poses and scale.
+        # Depths that agree with all matches still share an error of poses and scale.
         floor = (RELATIVE_FLOOR * self.inverse_depth).square()
         known = self.information
         if self.prior is not None:
@@ -184,7 +184,7 @@ class Keyframe:
 
     @property
     def shown_moving(self) -> Bool[Tensor, "p"] | None:
-        """Which cells of the straight image show something dynamic, where it is known."""
+        """Cells of the straight image that show something dynamic; None where unknown."""
         if self.moving is None or (shown := self._shown) is None:
             return self.moving
         nearest, is_cell = self.grid.cells_of(shown)
@@ -192,7 +192,7 @@ class Keyframe:
 
     @property
     def _shown(self) -> Float[Tensor, "p 2"] | None:
-        """Where the image that was tracked shows the cells of the straight one; none where they are
+        """Positions in the tracked image of the cells of the straight one; None where the two are
         the same."""
         view = self.table.view_of(self.id)
         return None if view is None else view.bent(self.grid.pixels)
@@ -202,39 +202,39 @@ class Keyframe:
 class KeyframeTable:
     """All keyframes of a run by id, their poses as rows of one array, and their large arrays.
 
-    Who works with keyframes holds ids, or a :class:`KeyframeSet`, and asks here.
+    Other code holds ids, or a :class:`KeyframeSet`, and looks keyframes up here.
     """
 
     next_id: Id = 0
-    """The id that the next keyframe gets; ids grow and are never used twice."""
+    """Id of the next keyframe; ids grow and are never used twice."""
     keyframes: dict[Id, Keyframe] = field(default_factory=dict)
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     lens: FoundLens | None = None
-    """Lens by which images were straightened at the end; none where they are as they were tracked.
-    Matches and depths of cells are always those of images as they were tracked."""
+    """Lens by which images were straightened at the end; None where they were not. Matches and
+    depths of cells always belong to the images as tracked."""
     frame_lenses: dict[Id, FrameLens] = field(default_factory=dict)
-    """What the lenses of keyframes had of their own then, where they had."""
+    """Per-keyframe intrinsics relative to that lens, if any."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
     """Grid of matches and depths, with the camera that saw them."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
-    """The pinhole that the images are of, or will be once they are straight. That of the grid is
-    another where a lens was found."""
+    """Pinhole of the images, once straightened. It differs from the grid's camera where a lens was
+    estimated."""
     focal_deviation: float = field(default=0.0, init=False, repr=False, metadata=NOT_STORED)
-    """Relative standard deviation of their focal length where nobody said it, before all matches
-    are asked for it."""
+    """Relative standard deviation of a focal length that was not given, before it is estimated from
+    all matches."""
     encode: Encode | None = field(init=False, repr=False, metadata=NOT_STORED)
-    """The flow operator's; images are encoded again by it when needed."""
+    """Encoder of the flow operator, for images that have to be encoded again."""
     set_of: dict[int, "KeyframeSet"] = field(init=False, repr=False, metadata=NOT_STORED)
-    """The set that a keyframe is in at present."""
+    """Present set of each keyframe."""
     removed: list[int] = field(default_factory=list, init=False, repr=False, metadata=NOT_STORED)
-    """Keyframes that somebody may still be looking at."""
+    """Removed keyframes whose pose and arrays may still be in use."""
 
     @staticmethod
     def on(
         grid: SampleGrid, encode: Encode | None = None, resident: int = RESIDENT
     ) -> "KeyframeTable":
-        """A table without keyframes."""
+        """Return an empty table."""
         return KeyframeTable().attached(grid, encode, resident)
 
     def attached(
@@ -244,8 +244,8 @@ class KeyframeTable:
         resident: int = RESIDENT,
         focal_deviation: float = 0.0,
     ) -> "KeyframeTable":
-        """The table with what belongs to the process: where depth is kept, how images are encoded,
-        how many of the large arrays of a name stay in memory, and how well the lens was known."""
+        """Set what is not stored: the grid of depths, the image encoder, how many large arrays of
+        a name stay in memory, and the prior deviation of the focal length. Return the table."""
         self.grid, self.camera, self.encode, self.set_of = grid, grid.camera, encode, {}
         if self.lens is not None:
             self.see_by(StraightView(self.camera, self.lens).seen_by)
@@ -256,18 +256,18 @@ class KeyframeTable:
         return self
 
     def see_by(self, camera: Camera) -> None:
-        """Take matches and depths for what another camera saw."""
+        """Assume another camera for matches and depths."""
         self.grid = SampleGrid(camera, self.grid.device)
 
     def view_of(self, id: int) -> StraightView | None:
-        """How the image of a keyframe was straightened; none where it is as it was tracked."""
+        """Return how the image of a keyframe was straightened; None where it was not."""
         if self.lens is None:
             return None
         view, own = _view(self.camera, self.lens), self.frame_lenses.get(id)
         return view if own is None else view.of_frame(own)
 
     def mirror(self) -> "KeyframeTable":
-        """A table without keyframes that has the large arrays of this one."""
+        """Return an empty table that shares the large arrays of this one."""
         twin = KeyframeTable(arrays=self.arrays, lens=self.lens, frame_lenses=self.frame_lenses)
         twin.grid, twin.camera = self.grid, self.camera
         twin.encode, twin.set_of = self.encode, {}
@@ -280,20 +280,20 @@ class KeyframeTable:
         return id in self.set_of
 
     def forget_removed(self) -> None:
-        """Let poses and large arrays of keyframes that were taken out go."""
+        """Free poses and large arrays of removed keyframes."""
         for id in self.removed:
             self.arrays.forget(id)
             self.poses.T_cw.pop(id, None)
         self.removed = []
 
     def new_set(self) -> "KeyframeSet":
-        """A set without keyframes."""
+        """Return an empty set."""
         return KeyframeSet().attached(self)
 
 
 @dataclass(eq=False)
 class KeyframeSet:
-    """Keyframes of a table that share a gauge, world and unit of their poses; in order of time."""
+    """Keyframes of a table whose poses share a gauge (world and unit); in order of time."""
 
     members: list[KeyframeId] = field(default_factory=list)
     """Their ids, earliest first."""
@@ -301,10 +301,10 @@ class KeyframeSet:
     _corrections: list[PoseCorrection] = field(
         default_factory=list, init=False, repr=False, metadata=NOT_STORED
     )
-    """Not yet taken; a checkpoint is written when all are."""
+    """Not yet taken; a checkpoint is written when all have been."""
 
     def attached(self, table: KeyframeTable) -> "KeyframeSet":
-        """The set as one of a table that has its keyframes."""
+        """Attach the set to the table of its keyframes and return it."""
         self.table = table
         table.set_of.update(dict.fromkeys(self.members, self))
         return self
@@ -325,7 +325,7 @@ class KeyframeSet:
 
     @property
     def grid(self) -> SampleGrid:
-        """Where depth is kept."""
+        """Sample grid of the depths."""
         return self.table.grid
 
     @property
@@ -347,8 +347,8 @@ class KeyframeSet:
         T_cw: Float[Tensor, "4 4"],
         id: int | None = None,
     ) -> Keyframe:
-        """Add a keyframe with unit inverse depth and no information; the latest, but where it was
-        one before, of that ``id``, and was removed."""
+        """Add a keyframe with unit inverse depth and no information: the latest, or with ``id`` one
+        that was removed."""
         table, grid = self.table, self.table.grid
         table.forget_removed()
         if id is None:
@@ -365,20 +365,20 @@ class KeyframeSet:
         return keyframe
 
     def put(self, keyframe: Keyframe) -> None:
-        """Add a keyframe as it is, with the id that it has; its pose is in the table."""
+        """Add an existing keyframe under its own id; its pose is in the table."""
         keyframe.table = self.table
         self.table.keyframes[keyframe.id] = keyframe
         self.table.set_of[keyframe.id] = self
         insort(self.members, keyframe.id)
 
     def absorb(self, other: "KeyframeSet") -> None:
-        """Take over the keyframes of another set, which are in this one's world already."""
+        """Take over the keyframes of another set, already in this set's gauge."""
         self.members = sorted([*self.members, *other.members])
         self.table.set_of.update(dict.fromkeys(other.members, self))
         other.members = []
 
     def remove(self, id: int) -> Keyframe:
-        """Take a keyframe out of set and table; it has pose and images until the next is added."""
+        """Remove a keyframe from set and table; pose and images last until the next is added."""
         table = self.table
         self.members.remove(id)
         del table.set_of[id]
@@ -386,24 +386,24 @@ class KeyframeSet:
         return table.keyframes.pop(id)
 
     def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
-        """World to camera, float64, on the CPU."""
+        """Return poses, world to camera, float64, on the CPU."""
         return torch.from_numpy(self.table.poses.rows(ids))
 
     def relative_poses(self, pairs: Sequence[tuple[int, int]]) -> Float[Tensor, "e 4 4"]:
-        """T_ji of each pair (i, j): from the camera of the first to that of the second."""
+        """Return T_ji of each pair (i, j): from the camera of the first to that of the second."""
         source, target = (self.poses([pair[k] for pair in pairs]) for k in (0, 1))
         return target @ se3_inverse(source)
 
     def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
-        """Inverse depths on the grid."""
+        """Return inverse depths on the grid."""
         return torch.stack([self[i].inverse_depth for i in ids])
 
     def informations(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
-        """Information on the grid, pixels^2 per inverse depth^2."""
+        """Return the information on the grid, pixels^2 per inverse depth^2."""
         return torch.stack([self[i].information for i in ids])
 
     def median_depths(self, ids: Sequence[int]) -> Float[Tensor, "n"]:
-        """Median depth of each keyframe's cells, float64, on the CPU."""
+        """Return the median depth of each keyframe's cells, float64, on the CPU."""
         return 1 / self.inverse_depths(ids).median(1).values.cpu().double()
 
     def rescale(self, factor: float) -> None:
@@ -413,9 +413,9 @@ class KeyframeSet:
             keyframe.rescale(factor)
 
     def correct(self, correction: PoseCorrection) -> None:
-        """Take over poses and scales of a loop closure or another global correction.
+        """Apply poses and scales of a loop closure or another global correction.
 
-        Who keeps something in world coordinates asks for it by ``take_corrections``.
+        Stages that keep data in world coordinates read it by ``take_corrections``.
         """
         for id, T in correction.after.items():
             keyframe = self[id]
@@ -424,12 +424,12 @@ class KeyframeSet:
         self._corrections.append(correction)
 
     def take_corrections(self) -> list[PoseCorrection]:
-        """Corrections made since the last call, earliest first."""
+        """Return the corrections made since the last call, earliest first."""
         taken, self._corrections = self._corrections, []
         return taken
 
     def moved(self, S: Float[Tensor, "4 4"]) -> PoseCorrection:
-        """The correction that takes all to another world, given the Sim(3) from it to theirs."""
+        """Return the correction to another world, given the Sim(3) from it to the present one."""
         scale = float(sim3_scale(S))
         before = {k.id: k.T_cw for k in self}
         after = {}
@@ -441,14 +441,14 @@ class KeyframeSet:
 
 @functools.lru_cache(maxsize=1)
 def _view(camera: Camera, lens: FoundLens) -> StraightView:
-    """One view for all keyframes, which keeps what it has computed."""
+    """Return one cached view for all keyframes."""
     return StraightView(camera, lens)
 
 
 def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:
-    """Check that sets that were read are of a table that was, and this of the camera of its grid.
+    """Check sets that were read against their table, and the table against its grid's camera.
 
-    Raises InputError if a keyframe is missing, of another camera, or not in its place.
+    Raises InputError if a keyframe is missing, of another camera, or out of order.
     """
     sizes, seen = table.grid.sizes, set[int]()
     check_tables(KeyframeTable, table, sizes, {})

@@ -1,6 +1,6 @@
-"""Kinds of stored records: what their classes declare of fields, numbers, arrays and references.
+"""Kinds of stored records: declarations of their fields, numbers, arrays and references.
 
-A kind is a type as an annotation has it; ``Annotated`` says more of a number or an array, see
+A kind is a type annotation; ``Annotated`` adds limits of a number or an array, see
 :mod:`geogs.limits`.
 """
 
@@ -19,18 +19,18 @@ class Part(NamedTuple):
 
     place: str
     kind: Any
-    """Without the marks of ``Annotated``."""
+    """Type without the marks of ``Annotated``."""
     marks: tuple[object, ...]
     value: Any
 
 
 def plain(kind: Any) -> Any:
-    """A kind without the marks of ``Annotated``."""
+    """Return a kind without the marks of ``Annotated``."""
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
 def marks_of(kind: Any) -> tuple[object, ...]:
-    """The marks of ``Annotated`` on a kind."""
+    """Return the marks of ``Annotated`` on a kind."""
     return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
 
 
@@ -41,17 +41,17 @@ def is_record(kind: Any) -> bool:
 
 
 def is_array(kind: Any) -> bool:
-    """Whether a kind is one of jaxtyping's."""
+    """Whether a kind is a jaxtyping array."""
     return isinstance(kind, type) and issubclass(kind, AbstractArray)
 
 
 def is_union(kind: Any) -> bool:
-    """Whether a kind is one of several."""
+    """Whether a kind is a union."""
     return get_origin(kind) in (Union, types.UnionType)
 
 
 def stored(kind: Any) -> dict[str, Any]:
-    """Names and kinds of the fields of a record that are stored."""
+    """Return names and kinds of the stored fields of a record."""
     hints = get_type_hints(kind, include_extras=True)
     if not is_dataclass(kind):
         return hints
@@ -59,12 +59,12 @@ def stored(kind: Any) -> dict[str, Any]:
 
 
 def alternatives(kind: Any) -> tuple[Any, ...]:
-    """Kinds in a union, but for None."""
+    """Return the kinds in a union except None."""
     return tuple(k for k in get_args(kind) if k is not type(None))
 
 
 def item_kinds(kind: Any, count: int) -> list[Any]:
-    """Kinds of the items of a list or tuple of so many."""
+    """Return the kinds of the items of a list or tuple of length ``count``."""
     kinds = list(get_args(kind))
     if get_origin(kind) is list:
         return kinds * count
@@ -72,7 +72,7 @@ def item_kinds(kind: Any, count: int) -> list[Any]:
 
 
 def fits(kind: Any, value: object) -> bool:
-    """Whether a value is of a kind, as far as one sees from outside."""
+    """Whether a value is of a kind, without checking its items."""
     kind = plain(kind)
     if kind in (bool, int):
         return type(value) is kind
@@ -82,7 +82,7 @@ def fits(kind: Any, value: object) -> bool:
 
 
 def lengths(kind: Any, value: Any) -> list[tuple[str, int]]:
-    """The letters in the annotated shape of an array, or of one that there may be, and lengths."""
+    """Return the letters in the annotated shape of an (optional) array, with their lengths."""
     several = alternatives(kind) if is_union(kind) else (kind,)
     array = next((k for k in map(plain, several) if is_array(k)), None)
     if array is None or not isinstance(value, array.array_type):
@@ -92,12 +92,12 @@ def lengths(kind: Any, value: Any) -> list[tuple[str, int]]:
 
 
 def schema(kind: Any) -> str:
-    """64 digits that change with any name, type or shape that a record of the kind declares."""
+    """Hash (64 digits) of every name, type and shape that a record of the kind declares."""
     return hashlib.sha256(described(kind).encode()).hexdigest()
 
 
 def described(kind: Any) -> str:
-    """A kind in words, with all that is below it."""
+    """Describe a kind and everything nested in it."""
     kind = plain(kind)
     if is_record(kind):
         named = (f"{n}:{described(k)}" for n, k in stored(kind).items())
@@ -116,7 +116,7 @@ def described(kind: Any) -> str:
 
 
 def parts(kind: Any, record: Any, place: str = "") -> Iterator[Part]:
-    """Every number, text and array of a record, with its place in it."""
+    """Yield every number, text and array of a record, with its path."""
     marks, kind = marks_of(kind), plain(kind)
     origin = get_origin(kind)
     if record is None:
@@ -139,5 +139,5 @@ def parts(kind: Any, record: Any, place: str = "") -> Iterator[Part]:
 
 
 def joined(place: str, part: object) -> str:
-    """The place of a part within a record."""
+    """Return the path of a part within a record."""
     return f"{place}.{part}" if place else str(part)

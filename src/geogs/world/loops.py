@@ -1,4 +1,4 @@
-"""Loops: what keyframes are recognised by, candidates, verified loops, and relative poses kept."""
+"""Loops: image features, the vocabulary, candidates, verified loops and relative poses."""
 
 from collections.abc import Container
 from dataclasses import dataclass, field
@@ -18,12 +18,12 @@ from geogs.world.keyframes import KeyframeTable
 from geogs.world.tables import check_tables
 
 Cause = Literal["geometry", "appearance"]
-"""What proposed a pair: the present poses, or appearance alone."""
+"""Origin of a candidate pair: the present poses, or appearance alone."""
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What is kept of an image to recognise it; the strongest of every cell come first."""
+    """Features of an image for place recognition; the strongest of every cell come first."""
 
     pixels: Float32[np.ndarray, "n 2"]
     """x, y."""
@@ -36,13 +36,13 @@ class ImageFeatures:
 
 @dataclass
 class Vocabulary:
-    """Binary words and which keyframes contain them; mutable."""
+    """Binary words and an index of the keyframes that contain them; mutable."""
 
     words: UInt8[np.ndarray, "v 32"] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
     keyframes: list[KeyframeId] = field(default_factory=list)
-    """Indexed so far, earliest first."""
+    """Keyframes indexed so far, earliest first."""
     counts: list[Int64[np.ndarray, "_ 2"]] = field(default_factory=list)
-    """For each of them its words, ascending, and how often it contains them."""
+    """For each keyframe its words, ascending, and their counts."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class TwoViewMatch:
 
     accepted: bool
     reason: str
-    """Why not; empty if accepted."""
+    """Reason for rejection; empty if accepted."""
     T_ji: Pose | None = None
     """First camera to second, float64. In the first's lengths if metric, else with a translation
-    of length one, which means nothing where the views have no parallax. None without a pose."""
+    of length one, which is arbitrary where the views have no parallax. None without a pose."""
     is_metric: bool = False
     scale: Positive | None = None
     """Lengths of the second's depth per length of the first's; None unless both have depth."""
@@ -81,7 +81,7 @@ class LoopCandidate:
 
 @dataclass(frozen=True)
 class VerifiedCandidate:
-    """A candidate and how the features of its two views match."""
+    """A candidate and the feature match of its two views."""
 
     candidate: LoopCandidate
     view: TwoViewMatch
@@ -98,25 +98,25 @@ class Loop:
     T_ji: Pose
     """First camera to second in the lengths of the first keyframe's depth, float64."""
     scale: Positive
-    """Lengths of the second's depth per length of the first's: what drifted in between."""
+    """Lengths of the second's depth per length of the first's: scale drift in between."""
     inliers: int
-    """Features that agree with the pose; 0 where the flow alone found it."""
+    """Features that agree with the pose; 0 where it comes from flow alone."""
     matched: float
     """Fraction of the cells whose flow agrees."""
     there: FlowMatch | None
-    """The flow from the first to the second, one edge; none where it is no longer needed."""
+    """Flow from the first to the second, one edge; None once it is no longer needed."""
     back: FlowMatch | None
 
     @property
     def S_ji(self) -> Float[Tensor, "4 4"]:
-        """Sim(3) that takes points of the first camera, in its lengths, to the second in its."""
+        """Sim(3) from the first camera to the second, each in its own unit of length."""
         S = self.scale * self.T_ji
         S[3, 3] = 1.0
         return S
 
     @property
     def flows(self) -> tuple[FlowMatch, FlowMatch]:
-        """There and back, where they are still kept."""
+        """Flow there and back, while they are kept."""
         assert self.there is not None
         assert self.back is not None
         return self.there, self.back
@@ -136,7 +136,7 @@ class RelativePoses:
     """Inverse variances of the error [tau, phi, sigma] in the frame of j: 1 / unit^2, 1 / rad^2
     and of the logarithm of scale; float64. Zero where nothing is known."""
     is_loop: Bool[Tensor, "e"]
-    """Edges that may be wrong altogether; the others are trusted."""
+    """Edges that may be outliers; the others are trusted."""
 
     def __len__(self) -> int:
         return len(self.source)
@@ -148,12 +148,12 @@ class RelativePoses:
         return [(min(pair), max(pair)) for pair in ends]
 
     def select(self, keep: Bool[Tensor, "e"]) -> "RelativePoses":
-        """The edges that are marked."""
+        """Return the edges where ``keep`` is true."""
         parts = (self.source, self.target, self.G, self.information, self.is_loop)
         return RelativePoses(*(p[keep] for p in parts))
 
     def rescaled(self, scale: Float[Tensor, "n"]) -> "RelativePoses":
-        """The same measurements after the unit of each keyframe was divided by ``scale``."""
+        """Return the same measurements after the unit of each keyframe was divided by ``scale``."""
         here, there = scale[self.source], scale[self.target]
         G = self.G.clone()
         G[:, :3, :3] *= (here / there)[:, None, None]
@@ -164,7 +164,7 @@ class RelativePoses:
 
     @staticmethod
     def none() -> "RelativePoses":
-        """No relative pose at all."""
+        """Return an empty set of relative poses."""
         empty = torch.zeros(0, dtype=torch.long)
         numbers = torch.zeros(0, 7, dtype=torch.float64)
         return RelativePoses(empty, empty, numbers.new_zeros(0, 4, 4), numbers, empty.bool())
@@ -175,26 +175,26 @@ class SegmentConstraints:
     """Relative poses between the keyframes of one segment, by id; mutable."""
 
     odometry: RelativePoses = field(default_factory=RelativePoses.none)
-    """From edges that the tracker no longer adjusts."""
+    """Relative poses from edges that the tracker no longer adjusts."""
     loops: RelativePoses = field(default_factory=RelativePoses.none)
     pending: int = 0
-    """Loops that disagree with the poses, found since the last attempt to close."""
+    """Number of loops that disagree with the poses, since the last attempt to close."""
     last_attempt: int = 0
-    """Number of keyframes at it."""
+    """Number of keyframes at the last attempt."""
 
 
 @dataclass
 class LoopTable:
-    """All that is known of loops; mutable."""
+    """State of loop closing; mutable."""
 
     keyframes: list[KeyframeId] = field(default_factory=list)
-    """Searched for loops so far, earliest first."""
+    """Keyframes searched for loops so far, earliest first."""
     features: dict[KeyframeId, ImageFeatures] = field(default_factory=dict)
     vocabulary: Vocabulary = field(default_factory=Vocabulary)
     found: list[list[VerifiedCandidate]] = field(default_factory=list)
-    """Candidates of the latest keyframes, about which the flow has not decided yet."""
+    """Candidates of the latest keyframes that the flow has not verified yet."""
     loops: list[Loop] = field(default_factory=list)
-    """Verified, earliest first."""
+    """Verified loops, earliest first."""
     between: list[Loop] = field(default_factory=list)
     """Loops between two segments."""
     constraints: dict[int, SegmentConstraints] = field(default_factory=dict)
@@ -204,7 +204,7 @@ class LoopTable:
 
 
 def check_loops(table: LoopTable, keyframes: KeyframeTable, segments: Container[int]) -> None:
-    """Check a table that was read; ``segments`` are the numbers of those that there are.
+    """Check a table that was read; ``segments`` are the numbers of the existing segments.
 
     Raises InputError if it is incomplete, or names keyframes or segments that are missing.
     """

@@ -1,4 +1,4 @@
-"""What is large and many: the values used last stay where they are fast, others leave."""
+"""A cache of large values: those used last stay, others are evicted."""
 
 import threading
 from collections import OrderedDict
@@ -10,10 +10,10 @@ V = TypeVar("V")
 
 
 class LruCache(Generic[K, V]):
-    """The values used last, at most ``limit`` of them; others are made again when they are wanted.
+    """The values used last, at most ``limit`` of them; others are computed again when needed.
 
-    ``leave`` is called with each value that has to go, so that it can be stored or its place be
-    given to another. For any thread, if ``leave`` is; a value is made without holding others up.
+    ``leave`` is called with each evicted value, so that it can be stored or its memory reused.
+    Thread-safe, if ``leave`` is; no lock is held while a value is computed.
     """
 
     def __init__(self, limit: int, leave: Callable[[K, V], object] | None = None) -> None:
@@ -29,16 +29,16 @@ class LruCache(Generic[K, V]):
         return key in self._values
 
     def peek(self, key: K) -> V | None:
-        """The value of a key if it is here; it does not count as used."""
+        """Return the value of a key if it is cached; it does not count as used."""
         return self._values.get(key)
 
     def items(self) -> list[tuple[K, V]]:
-        """All that is here, used last at the end."""
+        """Return all cached values, used last at the end."""
         with self._lock:
             return list(self._values.items())
 
     def get(self, key: K, make: Callable[[], V], wanted: Collection[K] = ()) -> V:
-        """The value of a key, made where it is not here; those ``wanted`` as well do not leave.
+        """Return the value of a key, computed if not cached; keys in ``wanted`` are not evicted.
 
         There are more than ``limit`` values only if so many are wanted.
         """
@@ -52,7 +52,7 @@ class LruCache(Generic[K, V]):
         return value
 
     def put(self, key: K, value: V, wanted: Collection[K] = ()) -> None:
-        """Keep a value as the one used last; those not used for longest leave."""
+        """Cache a value as the one used last; the least recently used are evicted."""
         with self._lock:
             if key not in self._values:
                 self._make_room(wanted)
@@ -61,7 +61,7 @@ class LruCache(Generic[K, V]):
                 self._values.move_to_end(key)
 
     def drop(self, key: K) -> None:
-        """Forget a value without calling ``leave``."""
+        """Remove a value without calling ``leave``."""
         with self._lock:
             self._values.pop(key, None)
 

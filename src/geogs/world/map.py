@@ -1,4 +1,4 @@
-"""The map: disks, what mapping knows of each keyframe, and how far the training is."""
+"""The map: disks, mapping data of each keyframe, and progress of the training."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -25,87 +25,87 @@ MAP_ARRAYS = {
     "sky": Bool[np.ndarray, "h w"],
     "rendered depth": Annotated[Float32[np.ndarray, "h w"], AT_LEAST_0],
 }
-"""The large arrays that a view may have."""
+"""Large arrays of a view, all optional."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthSearch:
-    """Where to look for a keyframe's depth, where no tracker says. Map units."""
+    """Depth range searched for a keyframe without a tracker's depth. Map units."""
 
     near: Positive
     typical: Positive
-    """Median: neighbours are chosen for their parallax there."""
+    """Median depth: neighbours are chosen for their parallax there."""
     far: Positive
 
 
 @dataclass(frozen=True, slots=True)
 class SearchedDepth:
-    """What there is to say of a dense depth whose arrays are in the table."""
+    """Statistics of a dense depth whose arrays are in the table."""
 
     typical: Positive
     """Median depth, map units."""
     scale: Positive
-    """Scale of the keyframe when the depth was as it is there."""
+    """Scale of the keyframe at which the stored depth holds."""
 
     def typical_at(self, scale: float) -> float:
-        """Median depth at another scale of the keyframe."""
+        """Return the median depth at another scale of the keyframe."""
         return self.typical * (scale / self.scale)
 
 
 @dataclass(eq=False)
 class ViewRow:
-    """What mapping knows of a keyframe."""
+    """Mapping data of a keyframe."""
 
     partners: list[KeyframeId] = field(default_factory=list)
     """Ids of the keyframes whose images check this one's depth, best first."""
     search: DepthSearch | None = None
-    """Where its depth is searched; none leaves that to the tracker's depth."""
+    """Searched depth range; None if it follows from the tracker's depth."""
     exposure: Float32[Tensor, "3"] | None = None
-    """Gain and offset that compensate its exposure, and the variance of the noise that is in its
-    grey values then; none until known."""
+    """Gain and offset of the exposure compensation, and the noise variance of the compensated grey
+    values; None until known."""
     depth: SearchedDepth | None = None
-    """None until it was searched."""
+    """Dense depth; None until it was searched."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingPlace:
-    """How far a long training is."""
+    """Progress of a long training."""
 
     steps: Number = 0
-    """Done."""
+    """Steps done."""
     total: Number = 0
-    """To be done in all."""
+    """Steps in total."""
     seconds: AtLeast0 = 0.0
-    """Spent."""
+    """Seconds spent."""
 
 
 @dataclass(eq=False)
 class RandomState:
-    """Where two generators of random numbers are: NumPy's PCG64, and PyTorch's on the CPU.
+    """State of two random number generators: NumPy's PCG64, and PyTorch's on the CPU.
 
-    The numbers that are stored are those of the last ``settle``.
+    The stored state is that of the last ``settle``.
     """
 
     state: int
     increment: int
     has_half: int
     half: int
-    """What is left of 64 bits that were drawn for 32."""
+    """Unused 32 of the last 64 bits drawn."""
     words: UInt8[Tensor, "n"]
-    """PyTorch's."""
+    """State of PyTorch's generator."""
     of_numpy: np.random.Generator = field(init=False, repr=False, metadata=NOT_STORED)
     of_torch: torch.Generator = field(init=False, repr=False, metadata=NOT_STORED)
 
     @staticmethod
     def seeded(seed: int) -> "RandomState":
-        """At the beginning of what a seed gives."""
+        """Return the initial state of a seed."""
         drawn = np.random.default_rng(seed).bit_generator.state
         inner, half = drawn["state"], (drawn["has_uint32"], drawn["uinteger"])
         words = torch.Generator().manual_seed(seed).get_state()
         return RandomState(inner["state"], inner["inc"], *half, words)
 
     def __post_init__(self) -> None:
-        """Raises InputError if the numbers are no state that there is."""
+        """Raises InputError if the numbers are no valid state."""
         self.of_numpy, self.of_torch = np.random.default_rng(0), torch.Generator()
         try:
             self.of_numpy.bit_generator.state = {
@@ -117,7 +117,7 @@ class RandomState:
             raise InputError("the random numbers are in no state that there is") from error
 
     def settle(self) -> None:
-        """Note where the generators are now."""
+        """Store the present state of the generators."""
         now = self.of_numpy.bit_generator.state
         self.state, self.increment = now["state"]["state"], now["state"]["inc"]
         self.has_half, self.half = now["has_uint32"], now["uinteger"]
@@ -126,38 +126,38 @@ class RandomState:
 
 @dataclass(eq=False)
 class MapTable:
-    """The map and all that its making depends on, beside the keyframes."""
+    """The map and all data needed to continue it, except the keyframes."""
 
     disks: GaussianMap
     random: RandomState
     views: dict[KeyframeId, ViewRow] = field(default_factory=dict)
-    """Rows by keyframe, in the order in which mapping came to know them."""
+    """Rows by keyframe, in the order in which mapping got them."""
     arrays: ArrayTable = field(default_factory=ArrayTable)
     """Masks, dense depths with confidences and normals, and depths rendered from the disks."""
     resident: list[KeyframeId] = field(default_factory=list)
-    """Keyframes whose arrays were in memory when the table was settled, those used last at the end:
-    of these depths have been rounded at each change of scale."""
+    """Keyframes whose arrays were in memory when the table was settled, those used last at the end.
+    Their depths have been rounded at each change of scale."""
     mapped: list[KeyframeId] = field(default_factory=list)
     """Keyframes whose depth is part of the map."""
     given: list[KeyframeId] = field(default_factory=list)
-    """Keyframes of a saved map, which stay as they are."""
+    """Keyframes of a saved map, which are fixed."""
     unit: Positive | None = None
-    """Median depth of the first keyframe, map units; none until it is mapped."""
+    """Median depth of the first keyframe, map units; None until it is mapped."""
     place: TrainingPlace = TrainingPlace()
-    """How far the training over all keyframes is, at each report of its progress."""
+    """Progress of the training over all keyframes, at its last report."""
     order: list[int] = field(default_factory=list)
-    """Keyframes that it comes to next, by their places among those mapped."""
+    """Keyframes trained next, as indices into ``mapped``."""
 
     @staticmethod
     def empty(device: torch.device | str, seed: int = 0) -> "MapTable":
-        """A map without disks."""
+        """Return a map without disks."""
         return MapTable(GaussianMap.empty(device), RandomState.seeded(seed))
 
 
 def check_map(table: MapTable, keyframes: KeyframeTable, size: tuple[int, int]) -> None:
-    """Check that a table that was read is of these keyframes; ``size`` is height and width.
+    """Check that a table that was read belongs to these keyframes; ``size``: height and width.
 
-    Raises InputError if it is incomplete, or of other keyframes.
+    Raises InputError if it is incomplete, or belongs to other keyframes.
     """
     height, width = size
     check_tables(MapTable, table, {}, {"keyframes": keyframes})

@@ -1,12 +1,11 @@
 """States as plain values for JSON and named arrays, and back; nothing in a file is ever executed.
 
 A state is a record: a dataclass or named tuple of plain values, arrays, arrays in archives, and of
-lists, tuples, dictionaries, unions and records of such. How one is read follows from the types that
-its class declares, never from the file: every value is checked against its field, every array
-against the type and the shape that jaxtyping's annotation names, where a letter stands for the
-same length throughout a record, and every number against what the field says of it
-(:mod:`geogs.limits`). Fields marked ``NOT_STORED`` belong to the process and are left at their
-default.
+lists, tuples, dictionaries, unions and records of these. It is read by the types that its class
+declares, never by the file: every value is checked against its field, every array against the
+dtype and shape of its jaxtyping annotation, where a letter stands for the same length throughout a
+record, and every number against the limits of its field (:mod:`geogs.limits`). Fields marked
+``NOT_STORED`` are left at their default.
 """
 
 from collections.abc import Mapping
@@ -38,7 +37,7 @@ from geogs.world.kinds import (
 )
 
 Values = Any
-"""What JSON holds: None, booleans, numbers, strings, lists and dictionaries of such."""
+"""JSON value: None, booleans, numbers, strings, lists and dictionaries of these."""
 
 _PLAIN = (bool, int, float, str, type(None))
 
@@ -47,24 +46,24 @@ _DTYPES = frozenset({
     "bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float16",
     "float32", "float64",
 })  # fmt: skip
-"""Types of arrays in archives."""
+"""Allowed dtypes of arrays in archives."""
 
 
 @dataclass
 class Packed:
-    """A record taken apart."""
+    """A packed record."""
 
     values: Values = None
     arrays: dict[str, Tensor] = field(default_factory=dict)
-    """Copies on the CPU, by their place in the record, such as ``mapper.map.position``."""
+    """Copies on the CPU, by their path in the record, such as ``mapper.map.position``."""
     archives: dict[str, Archive] = field(default_factory=dict)
-    """Archives that arrays of the record lie in, by name."""
+    """Archives of arrays of the record, by name."""
 
 
 def pack(kind: Any, record: object) -> Packed:
-    """Take apart a record of a kind (a type as an annotation has it).
+    """Pack a record of a kind (a type annotation).
 
-    Raises TypeError if something in it is not of its declared type, or cannot be stored.
+    Raises TypeError if a value is not of its declared type, or cannot be stored.
     """
     packed = Packed()
     packed.values = _Packer(packed).value(kind, record, "")
@@ -79,11 +78,11 @@ def unpack(
     device: torch.device | str = "cpu",
     name: str = "",
 ) -> Any:
-    """Make a record of a kind again; tensors that were on a GPU go to ``device``.
+    """Rebuild a record of a kind; tensors that were on a GPU go to ``device``.
 
-    ``name`` is the place of the record in the one that was packed.
+    ``name`` is the path of the record in the one that was packed.
 
-    Raises InputError, which names the part, if one is missing, superfluous, or of another type.
+    Raises InputError naming the part that is missing, superfluous, or of another type.
     """
     return _Unpacker(arrays, archives, torch.device(device)).value(kind, values, name)
 
@@ -96,7 +95,7 @@ class _Packer:
         self._packed = packed
 
     def value(self, kind: Any, value: Any, name: str) -> Values:
-        """JSON's form of a value; its arrays are noted by name."""
+        """Return the JSON form of a value; store its arrays by name."""
         kind = plain(kind)
         origin = get_origin(kind)
         if is_union(kind):
@@ -134,7 +133,7 @@ class _Packer:
         return str(value) if isinstance(value, Path) else value
 
     def _one_of(self, kind: Any, value: Any, name: str) -> Values:
-        """None, the form of the only alternative, or the number of the alternative and its form."""
+        """Return None, the form of the only alternative, or its number and form."""
         kinds = alternatives(kind)
         if value is None and type(None) in get_args(kind):
             return None
@@ -146,7 +145,7 @@ class _Packer:
         return self._wrong(kind, value, name)
 
     def _array(self, array: Tensor | np.ndarray, name: str) -> str:
-        """Note an array; returns where it is to be made."""
+        """Store a copy of an array; return "host" or "device"."""
         tensor = array if isinstance(array, Tensor) else torch.from_numpy(np.array(array))
         kept = torch.empty(tensor.shape, dtype=tensor.dtype)  # with no other memory than its own
         self._packed.arrays[name] = kept.copy_(tensor.detach())
@@ -170,10 +169,10 @@ class _Unpacker:
     ) -> None:
         self._arrays, self._archives, self._device = arrays, archives, device
         self._pieces: dict[tuple[Any, ...], Archived] = {}
-        """One for each place in an archive: its space is free once that one is gone."""
+        """One reference per piece of an archive: its space is freed with that reference."""
 
     def value(self, kind: Any, value: Values, name: str) -> Any:
-        """What a form stands for, given its kind."""
+        """Return the value of a JSON form, given its kind."""
         made = self._made(plain(kind), value, name)
         if not holds(marks_of(kind), made):
             raise InputError(f"{name} has a value that cannot be")
@@ -249,8 +248,8 @@ class _Unpacker:
     def _array(self, kind: Any, place: Values, name: str) -> Tensor | np.ndarray:
         if name not in self._arrays or not _is_in(place, ("host", "device")):
             self._wrong(name)
-        # In memory of its own, aligned as PyTorch does: by how the bytes of a file happen to lie,
-        # some libraries choose another order of additions.
+        # In memory aligned by PyTorch: some libraries choose the order of additions by the
+        # alignment, which in a file is arbitrary.
         made: Any = self._arrays[name].clone()
         if issubclass(kind.array_type, Tensor):
             made = made.to(self._device) if place == "device" else made

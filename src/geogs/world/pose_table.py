@@ -1,7 +1,7 @@
-"""Where all keyframes of a run are: a pose each, and all of them as rows of one array.
+"""Poses of all keyframes of a run, one by one and as rows of one array.
 
-A step that looks over every keyframe so far, to find those around one, reads the array; so it costs
-next to nothing of what asking keyframe by keyframe would.
+Searches over all keyframes, for those near one, read the array, which is much faster than a loop
+over keyframes.
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from geogs.world.arrays import NOT_STORED
 class PoseTable:
     """World-to-camera poses by keyframe id, float64, on the CPU.
 
-    A pose is replaced, never changed in place: who keeps a reference sees what it was.
+    A pose is replaced, never changed in place: old references keep their old value.
     """
 
     T_cw: dict[Id, Pose] = field(default_factory=dict)
     _rows: Float64[np.ndarray, "c 4 4"] = field(init=False, repr=False, metadata=NOT_STORED)
-    """The same by id, with room for more."""
+    """The same as rows by id, with spare rows."""
     _centres: Float64[np.ndarray, "c 3"] = field(init=False, repr=False, metadata=NOT_STORED)
 
     def __post_init__(self) -> None:
@@ -43,19 +43,19 @@ class PoseTable:
         self._centres[id] = -T[:3, :3].T @ T[:3, 3]
 
     def rows(self, ids: Sequence[int] | Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
-        """Poses of some keyframes: a copy."""
+        """Copy the poses of some keyframes."""
         return self._rows[np.asarray(ids, np.int64)]
 
     def centres(self, ids: Sequence[int] | Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Camera centres of some keyframes in the world: a copy."""
+        """Copy the camera centres of some keyframes, in the world."""
         return self._centres[np.asarray(ids, np.int64)]
 
     def nearest(self, id: int, ids: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:
-        """The ``count`` of some keyframes whose cameras were nearest to one's, nearest first; of
-        equally near ones the first."""
+        """Return the ``count`` keyframes among ``ids`` whose cameras are nearest to one's, nearest
+        first; ties go to the first."""
         distance = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
         if count < len(ids):
-            # Whatever is as near as the last of them takes part, so that the first are taken.
+            # Includes all that are as near as the last, so that ties go to the first.
             limit = np.partition(distance, count - 1)[count - 1]
             within = np.flatnonzero(distance <= limit)
         else:
@@ -65,8 +65,8 @@ class PoseTable:
     def around(
         self, id: int, ids: Int64[np.ndarray, "n"], angle: float, distance: float
     ) -> Int64[np.ndarray, "m"]:
-        """Keyframes among some that are less than a ``distance`` from one's camera and whose view
-        differs by less than an ``angle`` in degrees; nearest first."""
+        """Return the keyframes among ``ids`` less than ``distance`` from one's camera and rotated
+        by less than ``angle`` degrees; nearest first."""
         away = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
         within = np.flatnonzero(away < distance)
         within = within[np.argsort(away[within], kind="stable")]
@@ -82,7 +82,7 @@ class PoseTable:
 def rotation_angles(
     T: Float64[np.ndarray, "4 4"], others: Float64[np.ndarray, "n 4 4"]
 ) -> Float64[np.ndarray, "n"]:
-    """Angles in degrees between the orientation of a pose and those of others."""
+    """Return the rotation angles in degrees between a pose and others."""
     relative = np.einsum("ik,njk->nij", T[:3, :3], others[:, :3, :3])
     axis = relative[:, [2, 0, 1], [1, 2, 0]] - relative[:, [1, 2, 0], [2, 0, 1]]
     cosine = np.trace(relative, axis1=1, axis2=2) - 1

@@ -1,4 +1,4 @@
-"""Segments of video that no motion links to each other: all that tracking knows of each.
+"""Tracking state of each segment of video; no motion links two segments.
 
 Keyframes of one segment share a gauge, which is a coordinate frame and a unit of length. One of the
 segments is the main map, which is shown and written. Source: the atlas of ORB-SLAM3 (Campos et al.
@@ -26,19 +26,19 @@ from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 from geogs.world.tables import check_tables
 
 CONSTANT_RATE = 0.2
-"""Fraction by which a frame may come sooner or later than the one before and still count as one
-interval later: time stamps are rounded."""
+"""Fraction by which a frame interval may differ from the last and still count as equal: time stamps
+are rounded."""
 MAX_EXTRAPOLATION = 3.0
-"""Times the last motion that is predicted at most, however long no frame came."""
+"""Largest predicted motion over the last motion, however long no frame came."""
 
 
 class TrackState(Enum):
-    """What tracking of a segment is doing."""
+    """State of the tracking of a segment."""
 
     INITIALIZING = "initializing"
     TRACKING = "tracking"
     TURNING = "orientation only"
-    """There is a map, but too little of it in view: the camera's position is not known."""
+    """Too little of the map is in view: the camera's position is not known."""
     LOST = "lost"
 
 
@@ -48,30 +48,30 @@ class LastFrame:
 
     keyframe: KeyframeId
     T_rel: Pose
-    """Keyframe to this frame."""
+    """Transform from the keyframe to this frame."""
     velocity: Pose | None
-    """Motion from the frame before; None where the camera had been lost."""
+    """Motion from the frame before; None where the camera was lost there."""
     scale: Positive
-    """Scale of the keyframe when the two were measured."""
+    """Scale of the keyframe when ``T_rel`` and ``velocity`` were measured."""
     timestamp: float
     """Seconds."""
     interval: AtLeast0
-    """Seconds that the motion took."""
+    """Duration of the motion, seconds."""
 
     @staticmethod
     def at(
         keyframe: Keyframe, velocity: Float[Tensor, "4 4"] | None = None, interval: float = 0.0
     ) -> "LastFrame":
-        """The last frame where it is a keyframe."""
+        """Return the last frame where it is a keyframe."""
         eye = torch.eye(4, dtype=torch.float64)
         return LastFrame(keyframe.id, eye, velocity, keyframe.scale, keyframe.timestamp, interval)
 
     def T_cw(self, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
-        """World to camera by the keyframe's present pose and scale."""
+        """Return world to camera by the keyframe's present pose and scale."""
         return keyframe.at_present_scale(self.T_rel, self.scale) @ keyframe.T_cw
 
     def predicted(self, keyframe: Keyframe, timestamp: float) -> Float[Tensor, "4 4"]:
-        """World to camera of the next frame, at a time, at constant velocity."""
+        """Predict world to camera of the next frame, at a time, at constant velocity."""
         if self.velocity is None:
             return self.T_cw(keyframe)
         motion = keyframe.at_present_scale(self.velocity, self.scale)
@@ -83,11 +83,11 @@ class LastFrame:
 
 @dataclass(eq=False)
 class ChainedPositions:
-    """Where the cells of a first image lie in the latest, from where flow is followed on."""
+    """Positions of the cells of a first image in the latest, from which flow is continued."""
 
     there: Float32[Tensor, "1 p 2"] | None = None
     back: Float32[Tensor, "1 p 2"] | None = None
-    """Where the cells of the latest lie in the first."""
+    """Positions of the cells of the latest image in the first."""
 
     def reset(self) -> None:
         """Begin again at a new first image."""
@@ -96,14 +96,14 @@ class ChainedPositions:
 
 @dataclass(eq=False)
 class ReferenceView:
-    """A frame that later ones are matched with to follow the camera's orientation."""
+    """A frame that later ones are matched with to track the camera's orientation."""
 
     index: Number
     image: UInt8[np.ndarray, "h w 3"]
     R: Annotated[Float64[Tensor, "3 3"], RIGID] | None
-    """The camera that was located last to this one; none where nothing links them."""
+    """Rotation from the camera located last to this one; None where no motion links them."""
     encoded: Any = field(default=None, metadata=NOT_STORED)
-    """The flow operator's form of the image, or None where it has to be computed again."""
+    """The image encoded by the flow operator; None where it has to be computed again."""
 
 
 @dataclass(eq=False)
@@ -112,19 +112,19 @@ class OrientationTrack:
 
     view: ReferenceView | None = None
     flow: ChainedPositions = field(default_factory=ChainedPositions)
-    """From the view to the latest frame."""
+    """Flow from the view to the latest frame."""
     misses: Number = 0
     """Frames in a row that did not match the view."""
 
     def reset(self, view: ReferenceView | None = None) -> None:
-        """Begin again at a view, or where nothing links the next frame to those before it."""
+        """Begin again at a view, or without one: no motion then links the next frame."""
         self.view, self.misses = view, 0
         self.flow.reset()
 
 
 @dataclass(eq=False)
 class TrackStatus:
-    """Where the camera is by the frames so far."""
+    """Tracking state of the camera after the frames so far."""
 
     state: TrackState = TrackState.INITIALIZING
     last: LastFrame | None = None
@@ -140,7 +140,7 @@ class TrackStatus:
         return self.state is not TrackState.INITIALIZING
 
     def lose(self) -> None:
-        """The camera is lost; nothing says how it moves on."""
+        """Mark the camera as lost, with unknown velocity."""
         self.state = TrackState.LOST
         if self.last is not None:
             self.last.velocity = None
@@ -148,29 +148,29 @@ class TrackStatus:
 
 @dataclass(eq=False)
 class StartUpProgress:
-    """What a start needs to know beside its keyframes and frames."""
+    """State of a start-up beside its keyframes and frames."""
 
     flow: ChainedPositions = field(default_factory=ChainedPositions)
-    """From the last keyframe to the latest frame."""
+    """Flow from the last keyframe to the latest frame."""
     misses: Number = 0
     """Frames in a row that did not match the last keyframe."""
     min_keyframes: Number = 0
-    """Keyframes with which it is tried again, where an earlier attempt was far off."""
+    """Number of keyframes for the next attempt, where an earlier one was far off."""
 
 
 @dataclass(eq=False)
 class OdometryScale:
-    """Scale of poses that another tracker gives beside the images."""
+    """Scale of odometry poses given with the images."""
 
     scale: Positive | None = None
-    """Metres to the unit of the map; none as long as the measured motions do not fit."""
+    """Metres to the unit of the map; None as long as the measured motions do not fit."""
     deviation: Annotated[float, UNBOUNDED, Range(0)] = float("inf")
     """Relative deviation of the scale."""
 
 
 @dataclass(eq=False)
 class VideoSegment:
-    """All that tracking knows of one segment of video; mutable."""
+    """Tracking data of one segment of video; mutable."""
 
     number: Id = 0
     """Stable, never used again."""
@@ -180,9 +180,9 @@ class VideoSegment:
     frames: FrameLog = field(default_factory=FrameLog)
     status: TrackStatus = field(default_factory=TrackStatus)
     final: list[KeyframeId] = field(default_factory=list)
-    """Keyframes that are never removed any more, earliest first."""
+    """Keyframes that will not be removed any more, earliest first."""
     fixed: list[KeyframeId] = field(default_factory=list)
-    """Keyframes of a saved map, in whose gauge this segment is: they never change."""
+    """Keyframes of a saved map, which are fixed and define the gauge of this segment."""
     breaks: list[Id] = field(default_factory=list)
     """Keyframes that no motion links to the one before them."""
     sharpness: list[float] = field(default_factory=list)
@@ -190,7 +190,7 @@ class VideoSegment:
     start: StartUpProgress = field(default_factory=StartUpProgress)
     odometry: OdometryScale = field(default_factory=OdometryScale)
     is_metric: bool = False
-    """Whether a depth sensor started the map, which then is in metres."""
+    """Whether a depth sensor started the map; it is then in metres."""
 
     @property
     def ids(self) -> list[int]:
@@ -199,22 +199,22 @@ class VideoSegment:
 
     @property
     def free(self) -> list[int]:
-        """Ids of the keyframes that an adjustment of all moves, earliest first."""
+        """Ids of the keyframes that a global adjustment moves, earliest first."""
         fixed = set(self.fixed)
         return [k for k in self.ids if k not in fixed]
 
 
 @dataclass(frozen=True)
 class SegmentFate:
-    """What became of one segment of video."""
+    """Summary of one segment of video."""
 
     first_time: float
     """Seconds."""
     last_time: float
     keyframes: int
-    """It had when it was joined, or at the end."""
+    """Number of keyframes when it was joined, or at the end."""
     fate: Literal["world", "joined", "apart"]
-    """The main map, joined to it, or never: then its frames count as not tracked."""
+    """The main map, joined to it, or never joined: then its frames count as not tracked."""
 
 
 @dataclass(eq=False)
@@ -224,20 +224,20 @@ class SegmentTable:
     segments: list[VideoSegment] = field(default_factory=list)
     """Earliest first."""
     main: Id = 0
-    """Number of the one that is the main map."""
+    """Number of the main map's segment."""
     current: Id = 0
-    """Number of the one in which the camera is."""
+    """Number of the camera's present segment."""
     count: Id = 0
-    """Segments so far: the number that the next one gets."""
+    """Segments so far: the number of the next one."""
     joined: list[SegmentFate] = field(default_factory=list)
     why_not: str = ""
-    """Why no segment could be started, once the stream has ended; empty if one could."""
+    """Reason why no segment could be started, once the stream has ended; empty if one could."""
 
 
 def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -> None:
-    """Check segments that were read, of at most so many ``frames``; their keyframes are attached.
+    """Check segments that were read, of at most ``frames`` frames; their keyframes are attached.
 
-    Raises InputError if one is of other keyframes or another camera, or the table is incomplete.
+    Raises InputError if one has other keyframes or another camera, or the table is incomplete.
     """
     numbers = [segment.number for segment in table.segments]
     here = {table.main, table.current} if numbers else set[int]()

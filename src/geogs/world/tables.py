@@ -1,4 +1,4 @@
-"""What the tables of a record that was read must agree in: lengths, and who names whom."""
+"""Consistency checks of the tables of a record that was read: lengths and references."""
 
 from collections.abc import Container, Mapping
 from typing import Any
@@ -13,14 +13,14 @@ from geogs.world.arrays import ArrayTable
 from geogs.world.kinds import is_array, lengths, marks_of, parts, plain
 
 Tables = Mapping[str, Container[object]]
-"""The rows that there are, by the name of their table."""
+"""Existing rows, by the name of their table."""
 Sizes = Mapping[str, int]
-"""What letters in the shapes of arrays stand for."""
+"""Sizes by the letters in the shapes of arrays."""
 
 
 def check_tables(kind: Any, record: object, sizes: Sizes, tables: Tables) -> None:
-    """Raise InputError where an array of a record has another length than the sizes say, or a
-    reference names no row of its table; of others nothing is said."""
+    """Raise InputError where an array of a record disagrees with ``sizes``, or a reference names no
+    row of its table. Other sizes and tables are not checked."""
     for part in parts(kind, record):
         if is_array(part.kind) and _has_other(sizes, part.kind, part.value):
             raise InputError(f"{part.place} is of another camera")
@@ -35,10 +35,10 @@ def check_tables(kind: Any, record: object, sizes: Sizes, tables: Tables) -> Non
 def check_arrays(
     table: ArrayTable, kinds: Mapping[str, Any], sizes: Sizes, ids: Container[object]
 ) -> None:
-    """Raise InputError where a large array is none of those that there can be.
+    """Raise InputError where a large array is not an allowed one.
 
-    ``kinds`` are those of the arrays by their names, such as ``Float32[np.ndarray, "h w"]``, and
-    ``ids`` the keyframes that may have some. Arrays of numbers with limits are read.
+    ``kinds``: allowed kinds by array name, such as ``Float32[np.ndarray, "h w"]``; ``ids``:
+    keyframes that may have arrays. Arrays of floats are read to check their values.
     """
     for name, pieces in table.pieces.items():
         for id, piece in pieces.items():
@@ -48,7 +48,7 @@ def check_arrays(
 
 def _is_of(kind: Any, piece: Archived, sizes: Sizes) -> bool:
     bare, marks = plain(kind), marks_of(kind)
-    # Types and shapes need no values; an empty array of one byte's memory stands for them.
+    # Types and shapes need no values: check a broadcast array that takes next to no memory.
     shape = np.broadcast_to(np.zeros((), piece.dtype), piece.shape)
     if not isinstance(shape, bare) or _has_other(sizes, bare, shape):
         return False

@@ -1,4 +1,4 @@
-"""The world: all that a system knows, as one tree of plain data; what a checkpoint holds."""
+"""The world: the whole state of a SLAM system as one tree of plain data, stored in checkpoints."""
 
 from dataclasses import dataclass, field
 
@@ -14,38 +14,38 @@ from geogs.world.segments import SegmentTable, check_segments
 
 @dataclass(eq=False)
 class World:
-    """Live data of the stages, each of which takes it one step on."""
+    """State of all stages, each of which updates it."""
 
     keyframes: KeyframeTable = field(default_factory=KeyframeTable)
     """Poses, depths and images of all keyframes."""
     segments: SegmentTable = field(default_factory=SegmentTable)
-    """What tracking knows of each segment of video: edges, frames, state."""
+    """Tracking data of each segment of video: edges, frames, state."""
     loops: LoopTable = field(default_factory=LoopTable)
     map: MapTable | None = None
     """Disks and dense depths."""
     times: StageSeconds = field(default_factory=StageSeconds)
     frames: Number = 0
-    """Images so far."""
+    """Number of images so far."""
     timestamp: float | None = None
-    """Seconds of the last frame; none before the first."""
+    """Seconds of the last frame; None before the first."""
     unmapped: list[KeyframeId] = field(default_factory=list)
-    """Final keyframes that the map does not show yet, earliest first."""
+    """Final keyframes that are not in the map yet, earliest first."""
     adjusted: Number = 0
-    """Keyframes at the last bundle adjustment of all."""
+    """Number of keyframes at the last global bundle adjustment."""
     is_ended: bool = False
     """Whether the stream has ended."""
     maps_at_end: bool = False
-    """Whether keyframes are mapped all at once, after the stream."""
+    """Whether all keyframes are mapped at once, after the stream."""
     is_refined: bool = False
     """Whether the map was trained over all keyframes at the end."""
     uncertainty: Uncertainty | None = None
-    """How well frames are known, by the last adjustment of all keyframes after the stream."""
+    """Standard deviations of frames, by the global adjustment after the stream."""
     metric_scale: MetricScale | None = None
-    """The factor by which lengths were brought to metres."""
+    """Factor by which lengths were converted to metres."""
 
 
 def check_world(world: World) -> None:
-    """Check tables that were read against each other and the camera, whose grid is attached.
+    """Check tables that were read against each other and the camera of the attached grid.
 
     Raises InputError if something is missing or of another camera.
     """

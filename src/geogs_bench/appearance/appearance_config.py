@@ -12,21 +12,21 @@ class AppearanceConfig:
     """
 
     steps: int = 30_000
-    """Length of the schedule that the step numbers below refer to."""
+    """Length of the schedule to which the step numbers below refer."""
     sh_degree: int = 3
     """Highest degree of the spherical harmonics, 0 to 3."""
     sh_interval: int = 1000
-    """A further degree is used every so many steps."""
+    """Steps after which a further degree is used."""
     ssim_weight: float = 0.2
-    """Share of 1 - SSIM in the photometric loss; the rest is L1."""
+    """Weight of 1 - SSIM in the photometric loss; the rest is L1."""
     normal_weight: float = 0.05
     """Weight of the consistency of disk normals with those of the depth map."""
     normal_start: int = 7000
-    """Step from which on normals count."""
+    """Step from which normals count."""
     refine_start: int = 500
     """Step after which disks are added and removed."""
     refine_stop: int = 15_000
-    """Step at which that ends."""
+    """Step after which no disks are added or removed."""
     refine_every: int = 100
     """Steps between refinements."""
     refine_iterations: int = 25
@@ -36,7 +36,7 @@ class AppearanceConfig:
     grow_scale: float = 0.01
     """Disks up to this size are doubled, larger ones split; in scene scales."""
     split_shrink: float = 1.6
-    """Factor by which the two halves of a split disk are smaller."""
+    """Factor by which the two halves of a split disk shrink."""
     prune_opacity: float = 0.05
     """Disks less opaque than this are removed."""
     prune_scale: float = 0.1
@@ -46,7 +46,7 @@ class AppearanceConfig:
     means_rate: float = 1.6e-4
     """Learning rate of positions at the start, in scene scales."""
     means_decay: float = 0.01
-    """Factor that this rate has come down to at the end, exponentially."""
+    """Factor on this rate at the end of the exponential decay."""
     scales_rate: float = 5e-3
     """Learning rate of the logarithms of the sizes."""
     quaternions_rate: float = 1e-3
@@ -60,7 +60,7 @@ class AppearanceConfig:
     initial_opacity: float = 0.1
     """Opacity of a new disk at a start point."""
     scene_margin: float = 1.1
-    """Scene scale in largest distances of a camera from the middle of the cameras."""
+    """Scene scale over the largest distance of a camera from the middle of the cameras."""
     near: float = 0.01
     """Disks with centres nearer to a camera are not rendered, units of the poses."""
     min_alpha: float = 0.5

@@ -12,7 +12,7 @@ from geogs.geometry.neighbors import nearest_neighbors
 from geogs_bench.appearance.appearance_config import AppearanceConfig
 
 FLOATS_PER_DISK = 61
-"""Numbers a disk in the file format of 2DGS: 3 + 3 (normal) + 48 + 1 + 2 + 4."""
+"""Numbers per disk in the file format of 2DGS: 3 + 3 (normal) + 48 + 1 + 2 + 4."""
 _NEIGHBOURS = 3
 _SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0: sqrt(1 / 4 pi)."""
@@ -20,7 +20,7 @@ _SH_CONSTANT = 0.28209479177387814
 
 @dataclass(frozen=True)
 class AppearanceDisks:
-    """Parameters as they are trained; one row a disk, world frame, units of the poses."""
+    """Trained parameters; one row a disk, world frame, units of the poses."""
 
     means: Float[Tensor, "n 3"]
     quaternions: Float[Tensor, "n 4"]
@@ -61,7 +61,7 @@ class AppearanceDisks:
         return tuple(getattr(self, field.name) for field in fields(self))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "AppearanceDisks":
-        """The function of every parameter."""
+        """Apply a function to every parameter."""
         return AppearanceDisks(*(function(tensor) for tensor in self.tensors()))
 
     def detached(self) -> "AppearanceDisks":
@@ -80,7 +80,7 @@ def disks_at_points(
     config: AppearanceConfig,
     generator: torch.Generator,
 ) -> AppearanceDisks:
-    """A disk at each point: as large as its neighbours are far, in a random direction.
+    """Make a disk at each point, of a random direction.
 
     Colours are RGB in [0, 1]; the size is the root mean square distance of the three nearest
     neighbours.
@@ -102,5 +102,5 @@ def disks_at_points(
 
 
 def constant_from_colour(colour: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """The coefficient of degree 0 that shows an RGB colour in [0, 1] from everywhere."""
+    """Coefficient of degree 0 that gives an RGB colour in [0, 1] in every direction."""
     return (colour - 0.5) / _SH_CONSTANT

@@ -82,7 +82,7 @@ class _StructuralSimilarity(torch.autograd.Function):
 
 
 def _blur(images: Float[Tensor, "n h w"], padding: int) -> Float[Tensor, "n h2 w2"]:
-    """Gaussian mean of each window; the images go on with ``padding`` zeros.
+    """Gaussian mean of each window; the images are padded with ``padding`` zeros.
 
     One convolution a channel, without cuDNN: its convolutions may round to the 10 bits of TF32,
     and then the variance, a difference of squares, is wrong by as much as the constants of SSIM.

@@ -20,17 +20,17 @@ from geogs_bench.appearance.training_views import DeviceView, TrainingView, scen
 
 FEWEST_POINTS = 10
 OnTime = Callable[[float, AppearanceDisks], None]
-"""Called with the training seconds so far and the disks then; the clock stands still meanwhile."""
+"""Called with the training seconds so far and the disks; the clock is paused meanwhile."""
 
 
 @dataclass(frozen=True)
 class AppearanceResult:
-    """The trained disks, and what their training took."""
+    """The trained disks, and the cost of their training."""
 
     disks: AppearanceDisks
     iterations: int
     seconds: float
-    """Training alone, on the clock of the budget."""
+    """Time of the training alone, on the clock of the budget."""
     psnr: float
     """Mean over the training images, inside their masks, dB."""
 
@@ -38,7 +38,7 @@ class AppearanceResult:
 class AppearanceTrainer:
     """Disks in training; one random view an iteration.
 
-    Images go to the device and disks are made before the clock starts.
+    Images are copied to the device and disks are made before the clock starts.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class AppearanceTrainer:
 
     @property
     def disks(self) -> AppearanceDisks:
-        """The disks as they are now, without gradients; training goes on in place."""
+        """The current disks, without gradients; training changes them in place."""
         return self._optimizer.disks.map(lambda tensor: tensor.detach())
 
     def train(
@@ -86,8 +86,8 @@ class AppearanceTrainer:
     ) -> AppearanceResult:
         """Train for ``budget`` seconds.
 
-        ``on_time`` is called once at each of ``at_seconds``; what falls on the budget or after it
-        is called at the end.
+        ``on_time`` is called once at each of ``at_seconds``; calls at the budget or after it are
+        made at the end.
         """
         schedule = Schedule(self.config, budget)
         self._warm_up(schedule)
@@ -173,13 +173,13 @@ class AppearanceTrainer:
         )
 
     def _next(self) -> int:
-        """A random view; each comes once before any comes again."""
+        """Index of a random view; each comes once before any comes again."""
         if not self._queue:
             self._queue = self._order.permutation(len(self._views)).tolist()
         return self._queue.pop()
 
     def _warm_up(self, schedule: Schedule) -> None:
-        """One pass with every loss and no step, so that libraries load outside the time."""
+        """Run one pass with every loss and no step, so that libraries load outside the budget."""
         self._backward(self._views[0], schedule, float(self.config.steps))
         for tensor in self._optimizer.disks.tensors():
             tensor.grad = None

@@ -1,4 +1,4 @@
-"""Depth maps of coloured disks: where each pixel's ray crosses its median disk."""
+"""Depth maps of coloured disks: the crossing of each pixel's ray with its median disk."""
 
 import math
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from geogs_bench.appearance.rasteriser import MIN_ALPHA, PIXEL_SHARPNESS, Median
 from geogs_bench.appearance.training_views import TrainingView
 
 _MIN_FACING = 0.1
-"""Smallest cosine between a ray and the normal of a disk whose plane it is crossed with."""
+"""Smallest cosine between a ray and a disk's normal for which they are crossed."""
 _DEVIATIONS = 3.0
-"""A crossing lies within so many of the disk's larger standard deviations, and besides ..."""
+"""Largest distance of a crossing from the centre, in the disk's larger standard deviations ..."""
 _PIXELS = math.sqrt(-2 * math.log(MIN_ALPHA) / PIXEL_SHARPNESS)
-"""... within so many pixels of the centre: as far as the smallest disk can be seen."""
+"""... and, added to it, in pixels: the visible radius of the smallest disk."""
 
 
 @torch.no_grad()

@@ -29,13 +29,13 @@ class GradientStatistics:
         width: int,
         height: int,
     ) -> None:
-        """Count one image's gradient per pixel; it is taken in half image sizes."""
+        """Add one image's gradient, given per pixel; it is counted in half image sizes."""
         norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
         self._sum += torch.where(visible, norm, 0.0)
         self._views += visible
 
     def mean(self) -> Float[Tensor, "n"]:
-        """Mean norm over the images that showed the disk; 0 for the others."""
+        """Mean norm over the images that showed the disk; 0 for disks that none showed."""
         return self._sum / self._views.clamp(min=1)
 
 
@@ -49,7 +49,7 @@ def refine(
 ) -> tuple[Int[Tensor, "k"], AppearanceDisks]:
     """Double small disks and split large ones where gradients are high; remove useless ones.
 
-    Returns the rows that stay as they are, and the new disks.
+    Returns the rows that stay unchanged, and the new disks.
     """
     disks = disks.map(lambda tensor: tensor.detach())
     is_steep = gradient > config.grow_gradient
@@ -78,7 +78,7 @@ def split_disks(
 def _useless(
     disks: AppearanceDisks, step: float, scene_scale: float, config: AppearanceConfig
 ) -> Bool[Tensor, "n"]:
-    """Disks that are too transparent, or by now too large."""
+    """Mask of the disks that are too transparent or, at this step, too large."""
     clear = disks.opacities < config.prune_opacity
     if step <= config.prune_scale_start:
         return clear

@@ -1,4 +1,4 @@
-"""Adam with a learning rate for each parameter, for a number of disks that changes."""
+"""Adam with a learning rate for each parameter, for a changing number of disks."""
 
 import torch
 from jaxtyping import Int
@@ -11,7 +11,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class DiskOptimizer:
-    """The disks in training and their moments, which follow when disks come and go."""
+    """The disks in training and their moments, which are kept when disks are added or removed."""
 
     def __init__(self, disks: AppearanceDisks, config: AppearanceConfig, means_rate: float):
         self.disks = disks.map(_parameter)
@@ -27,13 +27,13 @@ class DiskOptimizer:
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=disks.means.is_cuda)
 
     def step(self, means_rate: float) -> None:
-        """Move by the gradients, which are dropped."""
+        """Take a step along the gradients, and drop them."""
         self._adam.param_groups[0]["lr"] = means_rate
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
     def change(self, kept: Int[Tensor, "k"], added: AppearanceDisks) -> None:
-        """Keep these rows, with their moments, and append disks whose moments are zero."""
+        """Keep these rows with their moments, and append disks with zero moments."""
         tensors = []
         pairs = zip(self._adam.param_groups, added.tensors(), strict=True)
         for group, new in pairs:

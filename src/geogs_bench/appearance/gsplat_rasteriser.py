@@ -22,20 +22,20 @@ _TILE = 16
 
 @dataclass(frozen=True)
 class _Projection:
-    """Disks in one image, as gsplat's operators pass them on; the first axis is the image."""
+    """Disks projected to one image, in gsplat's layout; the first axis is the image."""
 
     radii: Int32[Tensor, "1 n 2"]
-    """Half sizes in pixels of the boxes around the disks; 0 for those that are not shown."""
+    """Half sizes in pixels of the boxes around the disks; 0 for invisible ones."""
     means: Float[Tensor, "1 n 2"]
     depths: Float[Tensor, "1 n"]
     transforms: Float[Tensor, "1 n 3 3"]
     normals: Float[Tensor, "1 n 3"]
     screen: Float[Tensor, "1 n 2"]
-    """Zero; gets the gradient that densification looks at."""
+    """Zero; receives the gradient that densification uses."""
 
 
 class GsplatRasteriser:
-    """The image of gsplat's ``rasterization_2dgs``; needs an NVIDIA GPU.
+    """The rasteriser of gsplat's ``rasterization_2dgs``; needs an NVIDIA GPU.
 
     The operators are called one by one, since the function as a whole inverts the camera's pose
     up to three times an image, and each time the host waits for the GPU.
@@ -65,7 +65,7 @@ class GsplatRasteriser:
         background: Float[Tensor, "3"] | None,
         with_normals: bool,
     ) -> Rendering:
-        """Colours and, if wanted, normals: see :class:`~.rasteriser.Rasteriser`."""
+        """Render colours and, if wanted, normals: see :class:`~.rasteriser.Rasteriser`."""
         projection = self._project(disks, camera, T_cw)
         visible = (projection.radii > 0).all(-1)
         directions = disks.means + T_cw[:3, 3] @ T_cw[:3, :3]
@@ -97,8 +97,8 @@ class GsplatRasteriser:
     ) -> MedianDisks:
         """The median disk of each pixel: see :class:`~.rasteriser.Rasteriser`.
 
-        gsplat's median is the last channel's value of the median disk, so that each disk is
-        painted with its own number, from 1 on. Float32 holds these up to 2^24 disks.
+        gsplat's median is the last channel's value of the median disk, so that channel holds the
+        index of each disk, from 1 on. Float32 represents these for up to 2^24 disks.
         """
         if len(disks) >= 2**24:
             raise InputError(f"{len(disks)} disks are too many to tell apart; use fewer points.")
@@ -159,13 +159,13 @@ class GsplatRasteriser:
         )
 
     def _matrix(self, camera: Camera, device: torch.device) -> Float[Tensor, "3 3"]:
-        """Intrinsics on the device; kept, since sending them waits for the GPU."""
+        """Intrinsics on the device; cached, since sending them waits for the GPU."""
         if camera not in self._matrices:
             self._matrices[camera] = shifted_matrix(camera, device)
         return self._matrices[camera]
 
     def _directions(self, camera: Camera, device: torch.device) -> Float[Tensor, "h w 3"]:
-        """Rays of the pixels on the device, kept."""
+        """Rays of the pixels on the device, cached."""
         if camera not in self._rays:
             self._rays[camera] = camera.rays(torch.float32, device)
         return self._rays[camera]

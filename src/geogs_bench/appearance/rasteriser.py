@@ -1,4 +1,4 @@
-"""What the trainer asks of a rasteriser of coloured disks."""
+"""The trainer's interface to a rasteriser of coloured disks."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -12,7 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs_bench.appearance.appearance_disks import AppearanceDisks
 
 MIN_ALPHA = 1 / 255
-"""Below this a disk does not hit a pixel."""
+"""Least opacity with which a disk hits a pixel."""
 PIXEL_SHARPNESS = 2.0
 """Inverse variance in 1/pixel^2 of the Gaussian around a centre below which no disk shrinks."""
 
@@ -25,18 +25,18 @@ class Rendering:
     """RGB over the background, not clamped above."""
     alpha: Float[Tensor, "h w"]
     normal: Float[Tensor, "h w 3"] | None
-    """Blended normals of the disks, camera frame, facing the camera; none if not asked for."""
+    """Blended normals of the disks, camera frame, facing the camera; none unless requested."""
     depth_normal: Float[Tensor, "h w 3"] | None
-    """Normals of the expected depth, camera frame; zero at the border; none if not asked for."""
+    """Normals of the expected depth, camera frame; zero at the border; none unless requested."""
     screen: Float[Tensor, "*b n 2"]
-    """Gets the gradient of each disk's place in the image, per pixel, in the backward pass."""
+    """Receives in the backward pass the gradient of each disk's image position, per pixel."""
     visible: Bool[Tensor, "n"]
     """Disks that touch the image."""
 
 
 @dataclass(frozen=True)
 class MedianDisks:
-    """Which disk each pixel's ray sees at half its transmittance."""
+    """The disk at which each pixel's ray has half its transmittance."""
 
     index: Int64[Tensor, "h w"]
     """Row of the disk; -1 where there is none."""
@@ -57,13 +57,13 @@ class Rasteriser(Protocol):
         background: Float[Tensor, "3"] | None,
         with_normals: bool,
     ) -> Rendering:
-        """Colours and, if wanted, normals; the background is black if none is given."""
+        """Render colours and, if wanted, normals; the background is black if none is given."""
         ...
 
     def median_disks(
         self, disks: AppearanceDisks, camera: Camera, T_cw: Float[Tensor, "4 4"]
     ) -> MedianDisks:
-        """The last disk of each pixel in front of which more than half the light passes."""
+        """Find the last disk of each pixel in front of which more than half the light passes."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""What changes during training, by the elapsed part of the time budget."""
+"""Schedule of the training, by the elapsed fraction of the time budget."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ class Schedule:
     """Seconds."""
 
     def step(self, elapsed: float) -> float:
-        """Step of the public schedule that ``elapsed`` seconds stand for."""
+        """Step of the public schedule that corresponds to ``elapsed`` seconds."""
         return self.config.steps * elapsed / self.budget
 
     def sh_degree(self, step: float) -> int:
@@ -32,7 +32,7 @@ class Schedule:
 
 
 class RefinementClock:
-    """Says when disks are to be added and removed."""
+    """Decides when disks are added and removed."""
 
     def __init__(self, config: AppearanceConfig) -> None:
         self._config = config
@@ -40,11 +40,11 @@ class RefinementClock:
         self._iteration = 0
 
     def gathers(self, step: float) -> bool:
-        """Whether image gradients are still of use."""
+        """Whether image gradients are still used."""
         return step < self._config.refine_stop
 
     def is_due(self, step: float, iteration: int) -> bool:
-        """Whether to refine now; if so, the next time is counted from now on."""
+        """Whether to refine now; if so, the next interval begins now."""
         config = self._config
         due = (
             self.gathers(step)

@@ -1,4 +1,4 @@
-"""Posed images to train on."""
+"""Posed training images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from geogs.io.sources.posed.posed_source import PosedSource
 
 @dataclass(frozen=True)
 class TrainingView:
-    """An image, what of it counts, and where it was taken."""
+    """An image with its mask and its pose."""
 
     image: UInt8[np.ndarray, "h w 3"]
     """RGB."""
@@ -38,7 +38,7 @@ def scene_scale(views: Sequence[TrainingView], margin: float) -> float:
 
 
 class DeviceView:
-    """A view on the training device, with what does not change from one iteration to the next."""
+    """A view on the training device, prepared once for all iterations."""
 
     def __init__(self, view: TrainingView, device: torch.device) -> None:
         self.camera = view.camera

@@ -1,1 +1,1 @@
-"""The board: whole commands on fixed footage, one row each, beside what they reached before."""
+"""The board: whole commands on fixed footage, one row each, compared with an earlier record."""

@@ -1,4 +1,4 @@
-"""Runs the rows of the board and writes what they reached."""
+"""Runs the rows of the board and writes their scores."""
 
 import tempfile
 import threading
@@ -37,12 +37,12 @@ _OUTCOME = "outcome.json"
 _COMMIT = "commit.txt"
 _OPTIONS = ("name", "data", "output", "scenes", "device", "against", "fresh")
 _CORES_FOR_ONE = 2
-"""Cores for each command beside a GPU; a command without one gets a core."""
+"""Cores for each command that uses a GPU; a command without one gets one core."""
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A command by one seed."""
+    """A command with one seed."""
 
     row: Row
     seed: int
@@ -50,7 +50,7 @@ class _Job:
 
 @dataclass
 class Board:
-    """The rows that were asked for, on a device, into a folder."""
+    """The chosen rows, on a device, into a folder."""
 
     output: Path
     device: str
@@ -69,7 +69,7 @@ class Board:
     _done: int = 0
 
     def run(self) -> BoardRecord:
-        """Run what has not been run at this commit, and write the record.
+        """Run the commands that have not been run at this commit, and write the record.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -113,12 +113,12 @@ class Board:
 
     @property
     def side_by_side(self) -> int:
-        """Commands at a time, of those that do not run alone."""
+        """Number of concurrent commands, of those that do not run alone."""
         return max(1, available_cores() // (_CORES_FOR_ONE if self.on_gpu else 1))
 
     @contextmanager
     def _rendering(self) -> Iterator[dict[str, "Future[FootagePlace]"]]:
-        """The sequences of all rows, some still being made; what the user does not have is said."""
+        """Sequences of all rows, some still being rendered; missing data sets are reported."""
         wanted = {row.footage for row in self.chosen}
         found: dict[str, Future[FootagePlace]] = {}
         with ThreadPoolExecutor(self.side_by_side) as pool:
@@ -135,7 +135,7 @@ class Board:
             yield found
 
     def _outcome(self, job: _Job) -> Outcome:
-        """Run a command and measure its result; what was measured before is read."""
+        """Run a command and measure its result, or read the earlier measurement."""
         folder = self.output / job.row.name / f"seed-{job.seed}"
         outcome = None if self.fresh else self._measured_before(folder)
         if outcome is None:
@@ -152,7 +152,7 @@ class Board:
         place = self._places[row.footage].result()
         start = job.seed if row.command.startswith("run") else 0
         result = folder / "result"
-        # Word by word, as there may be spaces in a path.
+        # Split before formatting, as there may be spaces in a path.
         command = [word.format(**place.words) for word in row.command.split()]
         command += place.options.split()
         command += ["-o", str(result), "--device", self.device, "--seed", str(job.seed)]
@@ -176,7 +176,7 @@ class Board:
                 return replace(outcome, error=str(error))
 
     def _measured_before(self, folder: Path) -> Outcome | None:
-        """The outcome of an earlier call at the same commit, if nothing was changed since."""
+        """The outcome of an earlier call at the same commit, if no file has changed since."""
         mark = folder / _COMMIT
         if self.commit.endswith("+") or not mark.is_file() or mark.read_text() != self.commit:
             return None
@@ -197,7 +197,7 @@ class Board:
 def board(
     options: BenchOptions, say: Callable[[str], None]
 ) -> tuple[BoardRecord, list[Difference]]:
-    """Run the board as the options ask; what has changed since the record they name.
+    """Run the board with these options; return its record and the changes since an earlier one.
 
     Raises:
         InputError: an option is wrong, or the record cannot be read; found before anything is run.
@@ -228,7 +228,7 @@ def board(
 
 
 def _refuse_others(options: BenchOptions) -> None:
-    """Raises InputError where an option is given that the board has no use for."""
+    """Raise InputError if an option is given that the board does not use."""
     usual = BenchOptions(options.name)
     for known in fields(BenchOptions):
         if known.name not in _OPTIONS and getattr(options, known.name) != getattr(
@@ -238,7 +238,7 @@ def _refuse_others(options: BenchOptions) -> None:
 
 
 def _chosen(names: str, known: Sequence[Row]) -> tuple[Row, ...]:
-    """The rows of these names, all if none is named."""
+    """The rows of these names; all if none is named."""
     wanted = [name.strip() for name in names.split(",") if name.strip()]
     if strangers := [name for name in wanted if name not in {row.name for row in known}]:
         raise InputError(

@@ -9,7 +9,7 @@ from geogs_bench.board.comparison import FIGURES, Difference, Figure
 
 
 def markdown(board: BoardRecord, changes: Sequence[Difference]) -> str:
-    """The board as Markdown, why commands failed, and what has changed."""
+    """The board as Markdown, with the failures and the changes."""
     failures = [f"- {row.name}: {why}" for row in board.rows for why in dict.fromkeys(row.failures)]
     lines = [
         "# The board",

@@ -1,6 +1,6 @@
-"""A command as a user types it, in a process of its own, and what it took.
+"""A command as a user types it, in its own process, with its time and memory.
 
-Run as a script it is the process between: what is said of the memory of a child counts that of the
+Run as a script this file is the process between: the reported memory of a child counts that of the
 process that made it, so that has to be small.
 """
 
@@ -17,24 +17,24 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Spent:
-    """What a process took, and how it ended."""
+    """Time and memory of a process, and its exit code."""
 
     code: int
     seconds: float
-    """By the clock on the wall, from its start to its end."""
+    """Wall-clock time from its start to its end."""
     processor_seconds: float
-    """Of all its threads, and of the processes that it started and waited for."""
+    """Processor time of all its threads, and of the processes that it started and waited for."""
     memory_bytes: int
-    """The most that it, or one of these, had in memory."""
+    """Peak memory of it, or of one of these processes."""
 
 
 def run_geogs(arguments: Sequence[str], log: Path, caches: Path | None = None) -> tuple[Spent, str]:
-    """Run ``geogs`` with some arguments to its end; what it took, and the last line that it said.
+    """Run ``geogs`` to its end; return its time and memory, and the last line of its output.
 
     Args:
         arguments: of the command.
-        log: gets what it says.
-        caches: where it finds new folders for what it compiles; the usual ones if none is given.
+        log: file for its output.
+        caches: folder for new, empty caches of compiled code; the usual ones if none is given.
     """
     command = [sys.executable, "-m", "geogs.cli.main", *arguments]
     found = dict(os.environ)
@@ -57,10 +57,10 @@ def run_geogs(arguments: Sequence[str], log: Path, caches: Path | None = None) -
 
 
 def measured(command: Sequence[str]) -> Spent:
-    """Run a command to its end; what it says goes to the standard error."""
+    """Run a command to its end; its output goes to the standard error."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=sys.stderr)
-    # Popen.wait would take the process away without saying what it used.
+    # Popen.wait would reap the process without its resource usage.
     _, status, usage = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - start
     process.returncode = os.waitstatus_to_exitcode(status)

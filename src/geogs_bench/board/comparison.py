@@ -1,4 +1,4 @@
-"""A board beside an earlier one: what is worse, and what is better, by more than its noise."""
+"""Comparison of a board with an earlier one: the figures that changed by more than their noise."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,8 +10,8 @@ import numpy as np
 from geogs_bench.board.board_record import BoardRecord, RowRecord
 
 _T = 4.6
-"""Student's t for four degrees of freedom (three seeds before, three now), at which a difference
-that is none is called one in one of a hundred comparisons."""
+"""Student's t for four degrees of freedom (three seeds before, three now); one of a hundred
+comparisons of equal figures exceeds it."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Figure:
     """A column of the board."""
 
     name: str
-    """Of the attribute of an outcome."""
+    """Name of the attribute of an outcome."""
     title: str
     digits: int
     better: Literal["more", "less", "neither"]
@@ -58,7 +58,7 @@ class Difference:
     before: float
     now: float
     noise: float
-    """What the difference had to exceed."""
+    """Threshold that the difference exceeded."""
     is_worse: bool
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ class Difference:
 
 
 def compare(before: BoardRecord, now: BoardRecord) -> list[Difference]:
-    """What has changed by more than its noise, what is worse first."""
+    """Find the figures that changed by more than their noise, the worse ones first."""
     found = [
         difference
         for row in now.rows
@@ -82,12 +82,12 @@ def compare(before: BoardRecord, now: BoardRecord) -> list[Difference]:
 
 
 def _are_alike(before: RowRecord, now: RowRecord) -> bool:
-    """Whether a row is of the same command on the same footage."""
+    """Whether two rows have the same command and footage."""
     return before.command == now.command and before.footage == now.footage
 
 
 def _has_same_clock(before: BoardRecord, now: BoardRecord, row: RowRecord) -> bool:
-    """Whether seconds on the wall can be compared: beside others a command waits for these."""
+    """Whether wall-clock times can be compared: a command waits for concurrent ones."""
     is_same = before.machine == now.machine and before.device == now.device
     return is_same and row.runs_alone
 
@@ -111,7 +111,7 @@ def _differences(before: RowRecord, now: RowRecord, same_clock: bool) -> Iterato
 def _difference(
     row: str, figure: Figure, before: Sequence[float], now: Sequence[float]
 ) -> Difference | None:
-    """By Student's t test, and more than the figure's least difference."""
+    """Difference by Student's t test, if it also exceeds the figure's least difference."""
     if not before or not now:
         return None
     was = float(np.mean(before))

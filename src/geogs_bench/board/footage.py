@@ -1,4 +1,4 @@
-"""What the commands of the board see: synthetic sequences of fixed seeds, and data sets."""
+"""Input of the board's commands: synthetic sequences of fixed seeds, and data sets."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,18 +13,18 @@ from geogs_synth.camera.flaws import CameraKind
 from geogs_synth.motion.motion_kinds import MotionKind
 
 _MARK = "footage.txt"
-"""Written last, so that a sequence which was cut off, or is another by now, is made again."""
+"""Written last, so that an incomplete or outdated sequence is made again."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """Frames of a sequence, and their pixels."""
+    """Number of frames of a sequence, and their size."""
 
     frames: int
     width: int
     height: int
     stride: int = 1
-    """Every so many-th is used."""
+    """Stride of the frames that are used."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Footage:
     on_cpu: Size
     on_gpu: Size
     gap: tuple[float, float] = (0.0, 0.0)
-    """Fractions of the frames between which there are none: the camera was paused."""
+    """Fractions of the sequence between which frames are left out: the camera was paused."""
 
 
 @dataclass(frozen=True)
@@ -48,25 +48,25 @@ class KeptFootage:
     name: str
     folder: str
     on_cpu: str
-    """Options that make it small enough for two cores."""
+    """Options that make the sequence small enough for two cores."""
     on_gpu: str = ""
 
 
 @dataclass(frozen=True)
 class FootagePlace:
-    """Where a sequence lies."""
+    """A sequence on disk."""
 
     folder: Path
     title: str
-    """What it is, in words: results of another are not compared."""
+    """Description; only results of equal descriptions are compared."""
     frames: int
-    """That are there."""
+    """Number of frames on disk."""
     options: str = ""
-    """What commands are given on it."""
+    """Options of commands on this sequence."""
 
     @property
     def words(self) -> dict[str, str]:
-        """What stands for the names in a command's template."""
+        """Values for the names in a command's template."""
         return {
             "folder": str(self.folder),
             "video": str(self.folder / "video.mp4"),
@@ -75,7 +75,7 @@ class FootagePlace:
 
 
 def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None]) -> FootagePlace:
-    """Write a sequence below ``root`` by a command of its own, unless it is there.
+    """Render a sequence below ``root`` with ``geogs synth``, unless it is there.
 
     Raises:
         OutputError: it cannot be written.
@@ -111,7 +111,7 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
 
 
 def find(footage: KeptFootage, root: Path | None, on_gpu: bool) -> FootagePlace | None:
-    """A sequence of a data set below ``root``; none where it is not there."""
+    """Find a sequence of a data set below ``root``; none if it is not there."""
     folder = None if root is None else root / footage.folder
     if folder is None or not folder.is_dir():
         return None
@@ -121,7 +121,7 @@ def find(footage: KeptFootage, root: Path | None, on_gpu: bool) -> FootagePlace 
 
 
 def frames_used(command: Sequence[str], frames: int) -> int:
-    """Frames of a sequence of so many that a command sees, by its options."""
+    """Number of frames that a command uses of a sequence of ``frames``, by its options."""
     said = dict(pairwise(command))
     start, stride = int(said.get("--start", 0)), int(said.get("--stride", 1))
     return len(range(start, min(frames, int(said.get("--stop", frames))), stride))
@@ -133,7 +133,7 @@ def _is_missing(moment: float, footage: Footage) -> bool:
 
 
 def _cut(folder: Path, missing: list[int]) -> None:
-    """Take frames out of a sequence that lists its images with their times."""
+    """Remove frames from a sequence that lists its images with their times."""
     names = {f"frame{index:06d}.jpg" for index in missing}
     for name in names:
         (folder / "results" / name).unlink()

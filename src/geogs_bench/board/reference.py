@@ -1,4 +1,4 @@
-"""A fixed computation, by whose time those of commands are divided."""
+"""A fixed computation, the unit of the commands' processor time."""
 
 import time
 
@@ -9,10 +9,10 @@ ROUNDS = 3
 
 
 def reference_seconds() -> float:
-    """Seconds of the processor that it takes, the least of a few rounds.
+    """Processor time of the computation in seconds, the least of a few rounds.
 
     A mix of sorting, products of matrices, functions of arrays and filters of images, none of it
-    ours; so neither the speed of a machine nor what else it does matters much for ratios to it.
+    ours; so ratios to it hardly depend on the machine's speed or load.
     """
     return min(_once() for _ in range(ROUNDS))
 

@@ -1,12 +1,12 @@
-"""The rows of the board: which commands are run on which footage."""
+"""The rows of the board: commands and their footage."""
 
 from dataclasses import dataclass
 
 from geogs_bench.board.footage import Footage, KeptFootage, Size
 
 SEEDS = (0, 1, 2)
-"""Each command is run once by each: with this seed, and on images from that number on, so that
-tracking and mapping both come out a little different."""
+"""Each command is run once for each: with this seed, and from the image of this number on, so that
+tracking and mapping both vary a little."""
 
 
 @dataclass(frozen=True)
@@ -14,15 +14,15 @@ class Row:
     """A command on a sequence."""
 
     name: str
-    """Also that of its folder."""
+    """Name of the row and of its folder."""
     footage: str
     command: str
-    """As a user types it, without the output and the device; ``{folder}``, ``{video}`` and
-    ``{camera}`` stand for the files of the sequence."""
+    """Command as a user types it, without the output and the device; ``{folder}``, ``{video}`` and
+    ``{camera}`` are replaced by the files of the sequence."""
     runs_alone: bool = False
-    """Whether nothing else is run beside it, as its result depends on how long things take."""
+    """Whether nothing else runs at the same time, as its result depends on timing."""
     has_empty_cache: bool = False
-    """Whether it finds nothing compiled."""
+    """Whether it starts without compiled code."""
 
 
 _SMALL = Size(72, 160, 120, stride=2)
@@ -46,7 +46,7 @@ FOOTAGE = (
     Footage("dining", "dining", "clean", 37, Size(72, 160, 120, stride=2), Size(200, 480, 272)),
     Footage("slow-stream", "handheld-5hz", "clean", 38, Size(32, 160, 120), Size(40, 400, 300)),
 )
-"""Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
+"""Rooms, a street and a corridor, each with its own seed, filmed by cameras with flaws."""
 
 KEPT = (
     KeptFootage("staircase", "rooms/staircase", "--stop 40 --long-edge 160", "--stop 150"),

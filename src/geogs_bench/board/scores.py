@@ -13,11 +13,11 @@ from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.motion_scores import is_near
 
 _SAMPLES = 50_000
-"""On each surface; the deviation of a ratio by them is below 0.2 points."""
+"""Samples on each surface; the standard error of a ratio is below 0.2 points."""
 
 
 def with_scores(outcome: Outcome, folder: Path, truth: Path, frames: int) -> Outcome:
-    """An outcome with the errors of the result in ``folder``, whose sequence has ``frames``.
+    """Add the errors of the result in ``folder``, whose sequence has ``frames``, to an outcome.
 
     Raises:
         InputError: the result or the truth cannot be read.
@@ -54,7 +54,7 @@ def with_scores(outcome: Outcome, folder: Path, truth: Path, frames: int) -> Out
 
 
 def _with_online(outcome: Outcome, folder: Path, truth: Path) -> Outcome:
-    """With the errors of the surface that the stream left, where it was kept."""
+    """Add the errors of the surface at the end of the stream, if it was kept."""
     if not (folder / "mesh.ply").is_file():
         return outcome
     surface = _surface(_evaluated(folder, truth))
@@ -69,7 +69,7 @@ def _with_online(outcome: Outcome, folder: Path, truth: Path) -> Outcome:
 
 
 def _evaluated(folder: Path, truth: Path) -> Evaluation:
-    """As ``geogs eval`` does, without its pictures."""
+    """Evaluate like ``geogs eval``, without its pictures."""
     return evaluate(EvalSettings(output=folder, gt=truth, samples=_SAMPLES, plots=False))
 
 

@@ -1,1 +1,1 @@
-"""Every benchmark by its name, and what papers printed for it."""
+"""Every benchmark by its name, with the published figures."""

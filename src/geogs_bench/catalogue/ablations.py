@@ -1,4 +1,4 @@
-"""Benchmarks that compare variants of the settings on whatever scenes there are."""
+"""Benchmarks that compare variants of the settings on any scenes."""
 
 from dataclasses import replace
 
@@ -31,13 +31,13 @@ _NO_REFINEMENT = (Option("mapping.final-iterations", "0"),)
 
 
 def _set(**values: str) -> tuple[Option, ...]:
-    """Mapping options; two underscores stand for the dot between groups."""
+    """Mapping options; two underscores become the dot between groups."""
     names = {name: f"mapping.{name.replace('__', '.').replace('_', '-')}" for name in values}
     return tuple(Option(names[name], value) for name, value in values.items())
 
 
 _SNAPSHOTS = (2, 5, 10, 20, 40, 60, 90)
-"""Seconds at which the map's error is measured on the way."""
+"""Seconds at which the map's error is measured during the run."""
 
 INITIALISATION = Benchmark(
     "ablation-init",

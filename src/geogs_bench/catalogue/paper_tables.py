@@ -1,4 +1,4 @@
-"""All tables of the paper as one suite, with what stands in where the user has no data."""
+"""All tables of the paper as one suite, with stand-ins if the user has no data."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ def _of(benchmark: Benchmark, names: Sequence[str]) -> tuple[Variant, ...]:
 
 
 def _both(benchmark: Benchmark, names: Sequence[str]) -> Benchmark:
-    """The paper's rows of an ablation, by the default and by the paper's preset."""
+    """The paper's rows of an ablation, with the default and with the paper's preset."""
     return replace(benchmark, variants=with_paper(_of(benchmark, names)))
 
 
@@ -71,11 +71,11 @@ _FEW_ROWS = {
     "ablation-losses": ("all", "no-multi-view"),
     "light": ("default",),
 }
-"""Of the tables that have more than the small suite makes."""
+"""Rows that the small suite runs, of the tables that have more."""
 _SECONDS = 8.0
-"""Of each reconstruction from known poses."""
+"""Time of each reconstruction from known poses."""
 _COARSE = Option("mesh.voxel", "0.03")
-"""Metres, for these."""
+"""Voxel size in metres for these reconstructions."""
 _DENSE = (Option("mapping.disk.stride", "3"), Option("mapping.disk.edge-stride", "3"))
 _DENSE_NOTE = (
     "Rows of the paper have a disk at every third pixel instead of every eighth, as the images are "
@@ -84,7 +84,7 @@ _DENSE_NOTE = (
 
 
 def _small(table: SuiteTable) -> SuiteTable:
-    """Few rows of few small images."""
+    """Reduce a table to few rows on few small images."""
     test = table.benchmark
     rows = _of(test, _FEW_ROWS[test.name]) if test.name in _FEW_ROWS else test.variants
     coarse = (_COARSE,) if test.budgets else ()
@@ -118,6 +118,6 @@ PAPER_TABLES_SMALL = Suite(
     (Option("mapping.render-long-edge", "112"),),
     takes_data=False,
 )
-"""For two CPU cores."""
+"""The suite for two CPU cores."""
 
 SUITES = {suite.name: suite for suite in (PAPER_TABLES, PAPER_TABLES_SMALL)}

@@ -12,7 +12,7 @@ BENCHMARKS: dict[str, Benchmark] = {b.name: b for b in (*DATA_SETS, *ABLATIONS)}
 
 
 def find_benchmark(name: str) -> Benchmark:
-    """The benchmark of a name. Raises InputError with near names if there is none."""
+    """Find a benchmark by its name. Raises InputError with near names if there is none."""
     if name in BENCHMARKS:
         return BENCHMARKS[name]
     known = [*BENCHMARKS, *SUITES]

@@ -1,4 +1,4 @@
-"""Rows that many benchmarks have: what a plain run does, a map on the way, the paper's choices."""
+"""Rows of many benchmarks: a plain run, the map during the run, the paper's choices."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ PIPELINES = (
 
 
 def with_paper(variants: Sequence[Variant]) -> tuple[Variant, ...]:
-    """All variants, and after them all with the paper's preset (``paper-``), too."""
+    """All variants, followed by all with the paper's preset (``paper-``)."""
     papers = (
         replace(variant, name=f"paper-{variant.name}", options=(*PAPER.options, *variant.options))
         for variant in variants

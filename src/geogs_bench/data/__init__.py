@@ -1,1 +1,1 @@
-"""The scenes of data sets with their truth, found in a folder or rendered."""
+"""Scenes of data sets with their truth, found in a folder or rendered."""

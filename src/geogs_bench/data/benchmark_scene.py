@@ -1,11 +1,11 @@
-"""A scene of a benchmark: what to read, how, and what is known of the truth."""
+"""A scene of a benchmark: its source, options and truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 Culling = Literal["done", "frustum", "occlusion"]
-"""Culled by its provider; to be culled by the frusta; and by what hides it, too."""
+"""Culled by its provider; to be culled by the frusta; or by frusta and occlusion."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Option:
 
 
 def same_surface(long_edge: str, voxel: str) -> tuple[Option, ...]:
-    """What every method gets: images of one size, and the same surface from its depths."""
+    """Options of every method: images of one size, and the same surface from its depths."""
     return (
         Option("input.long-edge", long_edge),
         Option("mesh.voxel", voxel),
@@ -43,17 +43,17 @@ class DtuTruth:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a result can be compared with; a part is none where it is not there."""
+    """Ground truth of a scene; a part is none if it is not there."""
 
     poses: Path | None = None
-    """Path as for ``geogs eval --gt``, or the COLMAP model of a video at 60 frames a second, whose
-    images are called by their frames."""
+    """Path as for ``geogs eval --gt``, or the COLMAP model of a video at 60 frames a second, with
+    images named by their frames."""
     surface: Path | None = None
     """PLY in metres, in the frame of the poses."""
     points: Path | None = None
-    """PLY of what the camera saw of it; completeness is measured on them."""
+    """PLY of the points of it that the camera saw; completeness is measured on them."""
     culling: Culling = "occlusion"
-    """How ``surface`` is to be cut down to what the camera saw before whole meshes are compared."""
+    """Culling of ``surface`` to the seen part before whole meshes are compared."""
     dtu: DtuTruth | None = None
 
 
@@ -63,12 +63,12 @@ class BenchmarkScene:
 
     name: str
     source: Path
-    """What ``geogs run`` or ``geogs reconstruct`` reads."""
+    """Source for ``geogs run`` or ``geogs reconstruct``."""
     truth: Truth
     options: tuple[Option, ...] = ()
-    """What this scene needs, such as its intrinsics."""
+    """Options of this scene, such as its intrinsics."""
     kind: Literal["room", "object", "scan", "motion", "depth"] = "room"
-    """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU; of a
-    motion the trajectory alone is scored, of depth the views alone."""
+    """Scoring of a surface from known poses: a room in cm, an object in mm, a scan by DTU; for
+    ``motion`` only the trajectory is scored, for ``depth`` only the views."""
     has_depth: bool = False
-    """Whether the images come with the depth of a sensor."""
+    """Whether the images have the depth of a sensor."""

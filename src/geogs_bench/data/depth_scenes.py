@@ -1,4 +1,4 @@
-"""Sequences whose depth is known in their views: rendered, measured, or by a true surface."""
+"""Sequences with known depth in their views: rendered, measured, or from a true surface."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +18,13 @@ CELLS: tuple[Cell, ...] = (
     Cell("dining-1", "dining", Flaws(), 100, 400, 300, seed=1),
     Cell("street-0", "driving", Flaws(), 60, 496, 150),
 )
-"""What is rendered where the user gives no data: rooms, rooms of thin things, a street."""
+"""Rendered scenes if the user gives no data: rooms, rooms of thin things, a street."""
 
 
 def find_depth(root: Path) -> list[BenchmarkScene]:
-    """Rooms, streets and sequences of sensors below ``root``, or ``root`` itself.
+    """Find rooms, streets and sequences of sensors below ``root``, or ``root`` itself.
 
-    Those in the layout of Replica have depth images or a true surface, others depth images.
+    Sequences in the layout of Replica have depth images or a true surface, others depth images.
     """
     rendered = [
         _with_times(scene)
@@ -37,7 +37,7 @@ def find_depth(root: Path) -> list[BenchmarkScene]:
 
 
 def _with_times(scene: BenchmarkScene) -> BenchmarkScene:
-    """The scene with poses that have times, where ``geogs synth`` wrote them, too."""
+    """The scene with timed poses, if ``geogs synth`` wrote them, too."""
     if not (scene.source / "groundtruth.txt").is_file():
         return scene
     return replace(scene, truth=replace(scene.truth, poses=scene.source))
@@ -50,7 +50,7 @@ def _with_sensor(folder: Path) -> BenchmarkScene:
 
 
 def _is_tum_with_depth(folder: Path) -> bool:
-    """Where ``geogs synth`` lists its images like TUM, the depths are in no such list."""
+    """Whether a folder is TUM's, with depth; ``geogs synth`` lists no depths in TUM's layout."""
     return is_tum(folder) and (folder / "depth.txt").is_file()
 
 

@@ -16,13 +16,13 @@ _OFFICIAL = (
 )  # fmt: skip
 
 _HELD_OUT = 8
-"""Every so many-th image."""
+"""Stride of the held-out images."""
 _SAME = same_surface("800", "1")
-"""Half the size of the images; millimetres."""
+"""Images of half size; voxels in millimetres."""
 
 
 def find_dtu(root: Path) -> list[BenchmarkScene]:
-    """Scans below ``root`` (or its ``DTU`` or ``dtu``), each with its truth where it is there."""
+    """Find scans below ``root`` (or its ``DTU`` or ``dtu``), with their truth if it is there."""
     folders = folders_like(root, is_dtu, ("DTU", "dtu"))
     return [_scene(folder) for folder in folders]
 
@@ -43,6 +43,6 @@ def _scene(folder: Path) -> BenchmarkScene:
     number = re.search(r"(\d+)$", place.name)
     dtu = official_truth(int(number[1]), *place.parents[:2]) if number else None
     name = f"scan{number[1]}" if number else place.name
-    # Without a true surface some images are kept back, to see whether they agree across it.
+    # Without a true surface some images are held out, to measure their photo-consistency.
     options = _SAME if dtu else (*_SAME, Option("hold-out", str(_HELD_OUT)))
     return BenchmarkScene(name, folder, Truth(dtu=dtu), options, kind="scan")

@@ -1,4 +1,4 @@
-"""The matrix of motions and cameras that ``geogs bench motions`` renders, and finds again."""
+"""The matrix of motions and cameras that ``geogs bench motions`` renders and finds again."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,30 +28,30 @@ class Cell:
     width: int
     height: int
     moving: float = 0.0
-    """Share of the image that moves."""
+    """Fraction of the image that moves."""
     seed: int = 0
-    """Seed of the place and of the path."""
+    """Seed of the scene and of the path."""
     lamps: LampKind = "steady"
-    """Whether the light changes on the way."""
+    """Whether the light changes during the sequence."""
 
     @property
     def place(self) -> MotionKind:
-        """One of the motions through the same place, of which there are four."""
+        """Motion that names the scene, one of :data:`PLACES`."""
         return self.motion if self.motion in PLACES else "handheld"
 
 
 ROOM = Cell("synthetic-0", "handheld", Flaws(), 280, 640, 480)
-"""A room in whose frames the path comes back to its start."""
+"""A room with a path that comes back to its start."""
 
 
 def relighted(cell: Cell) -> Cell:
-    """The same path in a light that changes, by a camera whose exposure follows it."""
+    """The same path in changing light, with a camera that adapts its exposure."""
     flaws = replace(cell.flaws, gain_drift=0.7, colour_drift=0.1, vignetting=0.3)
     return replace(cell, name=f"{cell.name}-light", flaws=flaws, lamps="switched")
 
 
 PLACES: tuple[MotionKind, ...] = ("handheld", "dining", "driving", "corridor")
-"""A motion through each place."""
+"""One motion for each kind of scene."""
 
 
 def _cell(
@@ -66,7 +66,7 @@ def _cell(
 
 
 def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
-    """Turning at 60 degrees a second with a flaw of the Kinect at a time."""
+    """Rotations at 60 degrees a second, each with one flaw of the Kinect."""
     flaws = {
         "readout": Flaws(readout=0.03),
         "blur": Flaws(exposure=0.016),
@@ -81,7 +81,7 @@ def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
 
 
 def _moving_lenses(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
-    """A lens that is focused by 2 % to either side, and one that is moved against the shake."""
+    """A lens whose focal length varies by 2 % to either side, and a stabilised one."""
     return (
         Cell("handheld-focusing", "handheld", Flaws(focusing=0.02), frames, *size),
         Cell("walking-stabilised", "walking", Flaws(stabilisation=0.015), frames, *size),
@@ -106,7 +106,7 @@ SMALL: tuple[Cell, ...] = (
     _cell("driving", "clean", 60, _SMALL_STREET),
     _cell("corridor", "kinect", 60, _QVGA),
 )
-"""For two CPU cores."""
+"""Cells for two CPU cores."""
 
 FULL: tuple[Cell, ...] = (
     *(_cell(motion, camera, 120 if motion != "handheld-5hz" else 70, _LARGER)
@@ -128,9 +128,9 @@ FULL: tuple[Cell, ...] = (
 def render_cells(
     cells: Sequence[Cell], folder: Path, names: Sequence[str], say: Callable[[str], None]
 ) -> Path:
-    """Renders the cells of the given names (all if there are none) that are not there yet.
+    """Render the cells of the given names (all if there are none) that are not there yet.
 
-    Returns ``folder``, in which each cell has its own.
+    Returns ``folder``, in which each cell has its own folder.
 
     Raises:
         InputError: no cell has one of the names.
@@ -151,7 +151,7 @@ def render_cells(
 
 
 def find_motions(root: Path) -> list[BenchmarkScene]:
-    """Every sequence below ``root``, or ``root`` itself if it is one."""
+    """Find every sequence below ``root``, or ``root`` itself if it is one."""
     return [
         BenchmarkScene(folder.resolve().name, folder, Truth(poses=folder), kind="motion")
         for folder in folders_like(root, _is_sequence)
@@ -163,7 +163,7 @@ def _is_sequence(folder: Path) -> bool:
 
 
 def _is_there(cell: Cell, folder: Path) -> bool:
-    """Written last, so that a cell which was cut off is made again."""
+    """Whether a cell is complete: the points are written last."""
     return any((folder / cell.name).glob("points_seen_*.ply"))
 
 

@@ -1,7 +1,7 @@
 """Scenes for reconstruction from known poses: objects with masks, rooms, and DTU's scans.
 
-Objects and rooms are in the layout of Replica. What every method gets is the same: images of one
-size, about a hundred of a room, and the same surface from its depths (metres).
+Objects and rooms are in the layout of Replica. The input is the same for every method: images of
+one size, about a hundred of a room, and the same surface from its depths (metres).
 """
 
 from dataclasses import replace
@@ -16,7 +16,7 @@ _IMAGES = 100
 
 
 def find_objects(root: Path) -> list[BenchmarkScene]:
-    """Scenes below ``root`` (or its folder ``objects``) whose images have masks and a surface."""
+    """Find scenes with masks and a surface below ``root`` (or its folder ``objects``)."""
     folders = (folder for folder in (root, root / "objects") if folder.is_dir())
     found = ([s for s in find_rooms(folder) if _has_masks(s)] for folder in folders)
     objects = next((scenes for scenes in found if scenes), [])
@@ -25,12 +25,12 @@ def find_objects(root: Path) -> list[BenchmarkScene]:
 
 
 def find_posed_rooms(root: Path) -> list[BenchmarkScene]:
-    """The rooms below ``root``, with the stride that leaves about a hundred images."""
+    """Find rooms below ``root``, with the stride that leaves about a hundred images."""
     return [_thinned(scene) for scene in find_rooms(root) if not _has_masks(scene)]
 
 
 def find_any_posed(root: Path) -> list[BenchmarkScene]:
-    """DTU scans whose truth is there, else objects, else rooms: whatever ``root`` holds."""
+    """Find DTU scans with their truth, else objects, else rooms below ``root``."""
     scans = [scene for scene in find_dtu(root) if scene.truth.dtu is not None]
     return scans or find_objects(root) or find_posed_rooms(root)
 

@@ -13,22 +13,22 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import first_file, folders_like
 
 _RELIGHTED = "-light"
-"""Ending of a scene that is another one under other light, so that it shares its surface."""
+"""Ending of the name of a scene that is another one under other light, with the same surface."""
 _CULLED_FOLDERS = ("cull_replica_mesh", "gt_mesh_culled")
 
 
 def find_replica(root: Path) -> list[BenchmarkScene]:
-    """Scenes below ``root``, or ``root`` itself; those without poses are left out."""
+    """Find scenes below ``root``, or ``root`` itself; those without poses are left out."""
     return [_scene(folder) for folder in folders_like(root, _is_scene, ("Replica",))]
 
 
 def find_rooms(root: Path) -> list[BenchmarkScene]:
-    """Scenes of :func:`find_replica` whose true surface is there."""
+    """Scenes of :func:`find_replica` with a true surface."""
     return [scene for scene in find_replica(root) if scene.truth.surface is not None]
 
 
 def find_relighted(root: Path) -> list[BenchmarkScene]:
-    """Scenes that exist under steady and under changing light (``<scene>-light``), in pairs."""
+    """Find pairs of a scene under steady and under changing light (``<scene>-light``)."""
     scenes = {scene.name: scene for scene in find_rooms(root)}
     pairs = [
         (scenes[name.removesuffix(_RELIGHTED)], scene)

@@ -1,4 +1,4 @@
-"""Looking for scenes in a folder that the user gave: itself, or what lies below it."""
+"""Search for scenes in the user's folder: itself, or folders below it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ def folders_like(
 ) -> list[Path]:
     """``root`` if it is a scene, else the scenes directly in it or in its folders ``below``.
 
-    In natural order of their names, so scan40 comes before scan105.
+    They are in natural order of their names, so scan40 comes before scan105.
     """
     if is_scene(root):
         return [root]
@@ -27,7 +27,7 @@ def folders_like(
 
 
 def first_file(*candidates: Path) -> Path | None:
-    """The first that exists, if one does; the name may be a pattern such as ``mesh_*.ply``."""
+    """The first file that exists, or none; a name may be a pattern such as ``mesh_*.ply``."""
     for candidate in candidates:
         matches = sorted(candidate.parent.glob(candidate.name))
         if matches:

@@ -10,13 +10,13 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene, Option, Truth
 from geogs_bench.data.scene_folders import first_file, folders_like
 
 _STRIDE = 2
-"""Stride through the 60 frames a second of ScanNet++; the paper does not say which it used."""
+"""Stride through the 60 frames a second of ScanNet++; the paper does not state its own."""
 
 
 def find_tum(root: Path) -> list[BenchmarkScene]:
-    """Sequences below ``root``: ``<sequence>/rgb.txt`` and ``groundtruth.txt``.
+    """Find sequences below ``root``: ``<sequence>/rgb.txt`` and ``groundtruth.txt``.
 
-    Motion capture gives poses and no surface.
+    The truth, by motion capture, has poses and no surface.
     """
     return [
         BenchmarkScene(
@@ -30,7 +30,7 @@ def find_tum(root: Path) -> list[BenchmarkScene]:
 
 
 def find_seven_scenes(root: Path) -> list[BenchmarkScene]:
-    """Every sequence of the scenes below ``root``, which may be a scene or a sequence itself.
+    """Find every sequence of the scenes below ``root``, which may be a scene or a sequence itself.
 
     ``<scene>/seq-01/frame-000000.color.png`` with ``frame-000000.pose.txt``.
     """
@@ -40,7 +40,7 @@ def find_seven_scenes(root: Path) -> list[BenchmarkScene]:
 
 
 def find_scannet(root: Path) -> list[BenchmarkScene]:
-    """Scenes exported from their ``.sens`` files below ``root`` or its ``scans``.
+    """Find scenes exported from their ``.sens`` files below ``root`` or its ``scans``.
 
     ``<scene>/color``, ``pose`` and ``intrinsic``; an exporter may add a folder ``frames``.
     """
@@ -49,7 +49,7 @@ def find_scannet(root: Path) -> list[BenchmarkScene]:
 
 
 def find_scannetpp(root: Path) -> list[BenchmarkScene]:
-    """Scenes below ``root`` or its ``data``; those without frames or COLMAP poses are left out.
+    """Find scenes with frames and COLMAP poses below ``root`` or its ``data``.
 
     The iPhone's captures with their COLMAP poses, and the laser scan's mesh:
     ``data/<id>/iphone/{rgb.mkv or rgb/, colmap/}`` and ``data/<id>/scans/mesh_aligned_0.05.ply``.
@@ -85,7 +85,7 @@ def _scannet(folder: Path) -> BenchmarkScene:
 
 
 def _filmed(folder: Path) -> Path | None:
-    """Extracted frames where there are some, else the video."""
+    """Folder of the extracted frames if there are some, else the video."""
     phone = folder / "iphone"
     extracted = first_file(phone / "rgb" / "frame_*.jpg", phone / "rgb" / "frame_*.png")
     return phone / "rgb" if extracted is not None else first_file(phone / "rgb.m[kp][v4]")

@@ -11,15 +11,15 @@ from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 
 SAME_TIME = 0.005
-"""Seconds between an image and its pose."""
+"""Largest time between an image and its pose, seconds."""
 _VIDEO_RATE = 60.0
 """Frames per second of ScanNet++'s videos."""
 
 
 def read_true_poses(scene: BenchmarkScene) -> Trajectory | None:
-    """Camera-to-world poses in metres, at the times that ``geogs run`` gives the images.
+    """Camera-to-world poses in metres, at the times of the images in ``geogs run``.
 
-    Poses that are not finite (where the data set lost track) are left out. None where the scene
+    Poses that are not finite (tracking failures of the data set) are left out. None if the scene
     has no poses. Raises InputError if they cannot be read.
     """
     path = scene.truth.poses
@@ -29,7 +29,7 @@ def read_true_poses(scene: BenchmarkScene) -> Trajectory | None:
 
 
 def _of_video(model: Path) -> Trajectory:
-    """Poses of a COLMAP model by the last number in the names of its images, that of the frame."""
+    """Poses of a COLMAP model; the last number in the name of an image is its frame."""
     found = {}
     for image in read_model(model).images.values():
         digits, T_cw = re.findall(r"\d+", Path(image.name).stem), pose_of(image)

@@ -1,1 +1,1 @@
-"""A result's folder, and what is kept of it."""
+"""A result's folder, and its record."""

@@ -1,4 +1,4 @@
-"""What is kept of one run: how it was made, what it cost, how far it is from the truth."""
+"""Record of one run: its provenance, cost and errors."""
 
 import json
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
@@ -16,14 +16,14 @@ Weighting = Literal["area", "vertices", "points"]
 """Means over the area of the surfaces (NICE-SLAM), over the vertices of the meshes (the toolbox of
 Splat-SLAM), or over thinned points (DTU)."""
 StageName = Literal["online", "adjusted", "depth fusion", "final"]
-"""After the stream; after the final bundle adjustment and the map's update, where the paper ends;
-the keyframes' depths fused without the disks; after the refinement that the paper has not, or from
-known poses the result."""
+"""After the stream; after the final bundle adjustment and the map's update, as in the paper; the
+keyframes' depths fused without the disks; after the refinement, which the paper has not, or the
+result from known poses."""
 
 Place = Literal["all", "open", "edge", "thin", "behind thin", "bare", "grazing", "sky"]
 PLACES: tuple[Place, ...] = get_args(Place)
-"""Kinds of place in a view: ``all`` has depth, ``open`` is none of those after it; these overlap,
-but for the sky."""
+"""Kinds of region in a view: ``all`` has depth, ``open`` is none of those after it; these overlap,
+except for the sky."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class SurfaceScore:
     completeness: float
     chamfer: float
     ratio: float | None = None
-    """Part of the truth nearer than ``threshold``."""
+    """Fraction of the truth nearer than ``threshold``."""
     precision: float | None = None
-    """Part of the result nearer than ``threshold``."""
+    """Fraction of the result nearer than ``threshold``."""
     f_score: float | None = None
     threshold: float | None = None
     accuracy_median: float | None = None
@@ -55,14 +55,14 @@ class TrajectoryScore:
     """Poses compared."""
     scale: float
     keyframes_ate: float | None = None
-    """RMSE over the keyframes alone, with an alignment of their own."""
+    """RMSE over the keyframes alone, with their own alignment."""
     rigid_ate: float | None = None
     """RMSE over all frames after a rigid alignment, cm; none unless the result is in metres."""
 
 
 @dataclass(frozen=True)
 class PhotoScore:
-    """How well held-out images agree across the surface; without any surface truth."""
+    """Photo-consistency of held-out images across the surface; needs no true surface."""
 
     score: float
     """Mean correlation over all textured pixels, 0 where the mesh has a hole, percent."""
@@ -70,7 +70,7 @@ class PhotoScore:
     """Mean over the pixels that could be compared, -1 to 1."""
     ncc_median: float
     coverage: float
-    """Part of the masks that could be compared, percent."""
+    """Fraction of the masks that could be compared, percent."""
     views: int
     """Held-out views."""
     window: int
@@ -79,70 +79,70 @@ class PhotoScore:
 
 @dataclass(frozen=True)
 class MotionScore:
-    """How a camera's motion was followed."""
+    """Errors of a camera's estimated motion."""
 
     tracked: float
     """Frames that have a pose, percent."""
     turned: float = 0.0
-    """Frames of which an orientation is given, but no position, percent."""
+    """Frames with an orientation but no position, percent."""
     rotation: float | None = None
-    """RMSE of the orientations, degrees; none where nothing was tracked."""
+    """RMSE of the orientations, degrees; none if nothing was tracked."""
     ate: float | None = None
-    """RMSE of the positions after Sim(3) alignment, cm; none where the camera hardly moved."""
+    """RMSE of the positions after Sim(3) alignment, cm; none if the camera hardly moved."""
     relative: float | None = None
-    """The same over the length of the way, percent."""
+    """The same over the length of the path, percent."""
     within: float | None = None
-    """Positions within three of the deviations that the system claims, percent; none where it
-    claims none."""
+    """Positions within three of their predicted standard deviations, percent; none if none were
+    predicted."""
     is_called_reliable: bool | None = None
-    """What the system says of the whole; none where it says nothing."""
+    """The system's own verdict; none if it gives none."""
     is_reliable: bool | None = None
     """Whether the ATE is below a twentieth of the true path's extent and at most a fifth of the
-    frames are lost; none where there is no ATE."""
+    frames are lost; none without an ATE."""
 
 
 @dataclass(frozen=True)
 class PlaceScore:
-    """Depth of the mesh in the places of one kind; percent of their pixels where no unit is said.
+    """Depth of the mesh in the regions of one kind; in percent of their pixels unless stated.
 
-    Of the sky no more is known than whether there is a surface in it.
+    In the sky only the presence of a surface is known.
     """
 
     place: Place
     share: float
-    """Part of all pixels whose true depth is known."""
+    """Fraction of all pixels with a known true depth."""
     covered: float
     """Pixels that show the mesh."""
     median_error: float | None = None
-    """Percent of the depth, where it is seen."""
+    """Median error where the mesh is seen, percent of the depth."""
     within_2: float | None = None
-    """Off by no more than 2 %; holes are wrong."""
+    """Errors of at most 2 %; holes are wrong."""
     within_5: float | None = None
-    """Off by no more than 5 %; holes are wrong."""
+    """Errors of at most 5 %; holes are wrong."""
     in_front: float | None = None
     """Nearer than the truth by more than 5 %: fringes and sheets."""
     behind: float | None = None
     """Farther than the truth by more than 5 %."""
     normal: float | None = None
-    """Median angle between the normals, degrees; none where no true plane is there."""
+    """Median angle between the normals, degrees; none without a true plane."""
 
 
 @dataclass(frozen=True)
 class StageScore:
-    """A result as it stood at a stage."""
+    """Scores of a result at a stage."""
 
     stage: StageName
     trajectory: TrajectoryScore | None = None
     surfaces: tuple[SurfaceScore, ...] = ()
 
     def surface(self, weighting: Weighting) -> SurfaceScore | None:
-        """The score of a weighting."""
+        """The score with a weighting."""
         return next((s for s in self.surfaces if s.weighting == weighting), None)
 
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """The map after so many seconds."""
+    """Scores of the map after ``seconds``."""
 
     seconds: float
     disks: int | None
@@ -151,11 +151,11 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a result came about."""
+    """Provenance of a result."""
 
     command: str
     commit: str
-    """Commit of the program, with ``+`` where files were changed; its version without a history."""
+    """Commit of the program, with ``+`` if files were changed; its version without a history."""
     machine: str
     device: str
     seed: int
@@ -164,13 +164,13 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run took."""
+    """Cost of a run."""
 
     seconds: float
-    """Wall clock of the whole command, reading and writing included."""
+    """Wall-clock time of the whole command, with reading and writing."""
     frames: int | None = None
     frames_per_second: float | None = None
-    """Online, for SLAM; over everything else."""
+    """Of the stream for SLAM; over the whole run otherwise."""
     peak_memory_bytes: int | None = None
     peak_gpu_memory_bytes: int | None = None
     disks: int | None = None
@@ -196,14 +196,14 @@ class Record:
     places: tuple[PlaceScore, ...] = ()
     curve: tuple[CurvePoint, ...] = ()
     error: str | None = None
-    """Why there are no numbers."""
+    """Reason for missing numbers."""
 
     def stage(self, name: StageName) -> StageScore | None:
         """The scores of a stage."""
         return next((s for s in self.stages if s.stage == name), None)
 
     def place(self, name: str) -> PlaceScore | None:
-        """The scores of a kind of place."""
+        """The scores of a kind of region."""
         return next((s for s in self.places if s.place == name), None)
 
 
@@ -214,7 +214,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_record(path: Path) -> Record | None:
-    """Read what :func:`write_json` wrote; none where there is nothing or it is damaged."""
+    """Read a record of :func:`write_json`; none if the file is missing or damaged."""
     try:
         return read_dataclass(Record, read_json(path))
     except (InputError, *UNUSABLE):
@@ -222,7 +222,7 @@ def read_record(path: Path) -> Record | None:
 
 
 def read_dataclass(kind: type[T], values: dict[str, Any]) -> T:
-    """A dataclass from its dict; unknown names are an error, so that old files are not misread."""
+    """Make a dataclass from a dict; unknown names are an error, so old files are not misread."""
     hints = get_type_hints(kind)
     names = {f.name for f in fields(kind)}  # type: ignore[arg-type]  # always a dataclass
     if unknown := set(values) - names:
@@ -231,7 +231,7 @@ def read_dataclass(kind: type[T], values: dict[str, Any]) -> T:
 
 
 def _read(hint: Any, value: Any) -> Any:
-    """A value of a field: dataclasses and tuples of them are made again."""
+    """Value of a field; dataclasses and tuples of them are restored."""
     if value is None:
         return None
     if get_origin(hint) in (Union, UnionType):

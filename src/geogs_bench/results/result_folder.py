@@ -42,7 +42,7 @@ class ResultFolder:
         return file.stat().st_size if file.is_file() else None
 
     def stages(self) -> list[StageName]:
-        """The stages that left anything, in order of time."""
+        """The stages with files, in order of time."""
         files = ("mesh.ply", "trajectory.tum")
         return [
             stage
@@ -52,7 +52,7 @@ class ResultFolder:
 
     @property
     def _folders(self) -> dict[StageName, Path]:
-        """Where the stages are; without a refinement the result itself is the adjusted one."""
+        """Folders of the stages; without a refinement the result itself is the adjusted one."""
         folders = {stage: self.path / name for stage, name in _STAGE_FOLDERS.items()}
         if self.summary.get("refined", True):
             return folders
@@ -64,13 +64,13 @@ class ResultFolder:
         return folder / name if folder is not None and (folder / name).is_file() else None
 
     def mesh(self, stage: StageName | None = None) -> Surface | None:
-        """The surface of a stage, or of the result, whatever its last stage; none where there is
-        none. Map units."""
+        """The surface of a stage, or of the result, whatever its last stage; none if missing. Map
+        units."""
         file = self._file(stage, "mesh.ply")
         return None if file is None else read_surface(file)
 
     def trajectory(self, stage: StageName, name: str = "trajectory.tum") -> Trajectory | None:
-        """All poses of a stage, or the keyframes' (``keyframes.tum``); none where not there."""
+        """All poses of a stage, or the keyframes' (``keyframes.tum``); none if missing."""
         file = self._file(stage, name)
         return None if file is None else read_tum_trajectory(file)
 
@@ -80,13 +80,13 @@ class ResultFolder:
         return read_frame_poses(self.path) if is_there else None
 
     def states(self) -> list[tuple[float, str, float]]:
-        """Time, state and deviation of the position of every frame, as of ``read_states``; none
-        where the result has no table of them. Raises InputError if that is damaged."""
+        """Time, state and standard deviation of the position of every frame, by ``read_states``;
+        empty if the result has no table of them. Raises InputError if that is damaged."""
         file = self.path / "trajectory_uncertainty.csv"
         return read_states(file) if file.is_file() else []
 
     def snapshots(self) -> list[tuple[float, Path]]:
-        """Folders of the map after so many seconds, in order of time."""
+        """Seconds and folders of the map's snapshots, in order of time."""
         folders = [p for p in self.path.glob("snapshots/*") if (p / "mesh.ply").is_file()]
         timed = [(seconds, p) for p in folders if (seconds := _number(p.name)) is not None]
         return sorted(timed)

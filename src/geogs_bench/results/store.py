@@ -1,4 +1,4 @@
-"""What the harness keeps in the folder of each result, so that nothing is done twice."""
+"""Files of the harness in the folder of each result, so that nothing is done twice."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ from geogs_bench.results.record import (
 from geogs_bench.runners.task import Command
 
 RECORD_FILE = "bench.json"
-"""What is known of the result."""
+"""The record of the result."""
 
 _RUN_FILE = "bench_run.json"
 _LEFT_BY_EARLIER_RUNS = (
@@ -29,12 +29,12 @@ _LEFT_BY_EARLIER_RUNS = (
     "adjusted/keyframes.tum", "adjusted/mesh.ply", "depth_fusion/mesh.ply", "snapshots/*/mesh.ply",
     "snapshots/*/map.safetensors",
 )  # fmt: skip
-"""Files of a result that would be scored, were they still there."""
+"""Files of an earlier result that would be scored."""
 
 
 @dataclass(frozen=True)
 class CompletedRun:
-    """A run that came to its end: its source, how it was made, and what it took."""
+    """A complete run: its source, provenance and cost."""
 
     source: str
     provenance: Provenance
@@ -48,7 +48,7 @@ def config_hash(command: Command, settings: Mapping[str, object]) -> str:
 
 
 def completed_run(folder: Path, source: Path, digest: str) -> CompletedRun | None:
-    """The run that a folder holds, if it is one of this source with these settings."""
+    """The run in a folder, if it is of this source with these settings."""
     try:
         run = read_dataclass(CompletedRun, read_json(folder / _RUN_FILE))
     except (InputError, *UNUSABLE):
@@ -60,14 +60,14 @@ def completed_run(folder: Path, source: Path, digest: str) -> CompletedRun | Non
 
 
 def write_completed_run(folder: Path, run: CompletedRun) -> None:
-    """Say that the folder's run is complete. Raises OutputError if that fails."""
+    """Mark the folder's run as complete. Raises OutputError if that fails."""
     write_json(folder / _RUN_FILE, run)
 
 
 def clear(folder: Path) -> Path:
-    """Make the folder ready for a new run: what an earlier one left must not be scored.
+    """Prepare the folder for a new run: delete the files of an earlier one that would be scored.
 
-    Nothing else in it is touched, and no link to another folder is followed.
+    No other file is touched, and no link to another folder is followed.
 
     Raises:
         OutputError: it cannot be made or written.

@@ -1,1 +1,1 @@
-"""What runs a task of a benchmark: geogs, parts of it, and the baseline with colour."""
+"""Runners of a benchmark's tasks: geogs, parts of it, and the baseline with colour."""

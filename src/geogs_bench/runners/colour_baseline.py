@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from geogs_photos.start_points import StartPoints
 
 _BUDGET = 120.0
-"""Seconds of training where none are given; start points and mesh come on top."""
+"""Default training time in seconds; start points and mesh come on top."""
 
 
 def require_packages() -> None:
-    """Raises InputError where what trains the baseline is not installed."""
+    """Raise InputError if the packages that train the baseline are not installed."""
     for needed in ("gsplat", "pycolmap"):
         if importlib.util.find_spec(needed) is None:
             raise InputError(
@@ -37,7 +37,7 @@ def require_packages() -> None:
 def train_baseline(settings: ReconstructSettings) -> None:
     """2D Gaussian splatting with colour, by gsplat: start points, training, mesh.
 
-    Of the settings those of the disk map do not count, nor those of its mesh but for the voxels.
+    The settings of the disk map have no effect, and of its mesh only the voxels.
 
     Raises:
         InputError: the source cannot be read, or has too little texture.
@@ -89,7 +89,7 @@ def _train(
     device: str,
     seconds: dict[str, float],
 ) -> "tuple[AppearanceResult, Mesh]":
-    """Train, writing a mesh at each snapshot; the seconds of both parts go into ``seconds``.
+    """Train, and write a mesh at each snapshot; the times of both parts go into ``seconds``.
 
     Meshes are made by the same fusion as the system's own maps.
     """

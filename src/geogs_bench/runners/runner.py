@@ -1,4 +1,4 @@
-"""Runs tasks as ``geogs run`` and ``geogs reconstruct`` would, by the same options."""
+"""Runs tasks like ``geogs run`` and ``geogs reconstruct``, with the same options."""
 
 from dataclasses import asdict, replace
 from typing import cast
@@ -13,17 +13,17 @@ from geogs_bench.runners.colour_baseline import require_packages, train_baseline
 from geogs_bench.runners.task import Task
 
 _NO_SETTINGS = ("source", "output", "resume", "checkpoint_every")
-"""What changes nothing about a result."""
+"""Settings that do not change a result."""
 
 
 class Runner:
-    """Runs tasks by what is behind the two commands, by a part of it, or by the baseline."""
+    """Runs tasks with the code of the two commands, a part of it, or the baseline."""
 
     def settings(self, task: Task) -> dict[str, object]:
         """Every setting of the command but its output.
 
         Raises:
-            InputError: an option is wrong, or what the baseline needs is not installed.
+            InputError: an option is wrong, or a package of the baseline is not installed.
         """
         if task.command == "colour-2dgs":
             require_packages()
@@ -32,11 +32,11 @@ class Runner:
         return {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
 
     def run(self, task: Task) -> None:
-        """Run the command; what ``geogs run`` does but for the map; move one map, as the stream
-        has left it, by the rule that the options name; or train the baseline.
+        """Run the command, or its tracking alone; correct one map, saved at the end of the stream,
+        by the rule in the options; or train the baseline.
 
         Raises:
-            GeogsError: it failed, in a sentence.
+            GeogsError: it failed, with a message.
         """
         from geogs.application.reconstruct import reconstruct_to_folder
         from geogs.application.run import run
@@ -59,7 +59,7 @@ class Runner:
 
 
 def settings_of(task: Task) -> RunSettings | ReconstructSettings:
-    """What a task's options say, by the command's own parser."""
+    """Settings from a task's options, by the command's own parser."""
     argv = [str(task.source), "-o", str(task.output)]
     argv += [argument for option in task.options for argument in option.arguments()]
     if task.command in ("run", "track", "update"):

@@ -1,6 +1,6 @@
-"""One map as the stream has left it, corrected again and again: the rules of its update alone.
+"""One map, saved at the end of the stream and corrected by each rule of the map's update.
 
-The paper saves the map before its final bundle adjustment and moves that one map by every rule.
+The paper saves the map before its final bundle adjustment and corrects that one map by every rule.
 """
 
 from dataclasses import replace
@@ -22,15 +22,15 @@ from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
 
 FOLDER = "before"
-"""Beside the folders of the variants: the map before its correction."""
+"""Folder, next to those of the variants, of the map before its correction."""
 
 
 @on_one_torch_thread
 def correct_saved_map(settings: RunSettings, output: Path, progress: RunProgress) -> None:
-    """Move the map that the stream has left by the settings' rule; write what comes of it.
+    """Correct the map at the end of the stream by the settings' rule; write the result.
 
-    The first call in a place runs the stream and keeps a checkpoint of its end; others with the
-    same settings but for the rule start from there.
+    The first call in a folder runs the stream and keeps a checkpoint of its end; later calls whose
+    settings differ only in the rule start from there.
 
     Raises:
         InputError: the source or a setting cannot be used, or no map was started.
@@ -58,7 +58,7 @@ def _saved(place: Path, settings: RunSettings) -> SavedRun | None:
 
 
 def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> SavedRun:
-    """Track and map up to the end of the stream, and keep that."""
+    """Track and map up to the end of the stream, and save a checkpoint."""
     config, device = settings.config, require_device(settings.device)
     source = self_calibrated(open_source(settings.source, config.input), config, device)
     slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
@@ -77,7 +77,7 @@ def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> Sa
 
 
 def _without_rule(settings: RunSettings) -> RunSettings:
-    """All that decides about the map before it is corrected at the end."""
+    """The settings that determine the map before its correction."""
     config = settings.deciding().config
     ablation = replace(config.mapping.ablation, map_update="coherent")
     mapping = replace(config.mapping, ablation=ablation)

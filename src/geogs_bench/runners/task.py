@@ -7,8 +7,8 @@ from typing import Literal
 from geogs_bench.data.benchmark_scene import Option
 
 Command = Literal["run", "track", "update", "reconstruct", "colour-2dgs"]
-"""SLAM, its tracking alone, one map of it moved by a rule of its update, the map from known poses,
-or the baseline with colour from known poses."""
+"""SLAM, its tracking alone, one saved map corrected by a rule, the map from known poses, or the
+baseline with colour from known poses."""
 
 
 @dataclass(frozen=True)

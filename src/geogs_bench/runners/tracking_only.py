@@ -1,4 +1,4 @@
-"""The tracker and the loops on a source, without any map: what decides where the camera is."""
+"""The tracker and the loop closures on a source, without a map: all that estimates the poses."""
 
 import json
 import time
@@ -28,7 +28,7 @@ def track_to_folder(
 ) -> None:
     """Track every frame, close loops, adjust all keyframes; write trajectory and summary.
 
-    A video in which no frame can be tracked leaves a summary that says so, and no trajectory.
+    A video in which no frame can be tracked leaves a summary with that failure, and no trajectory.
 
     Raises:
         InputError: the source or a setting cannot be used.

@@ -1,1 +1,1 @@
-"""From a result's folder and the truth of its scene to scores."""
+"""Scores of a result's folder against the truth of its scene."""

@@ -1,4 +1,4 @@
-"""Views of a result beside their true depth: image, both depths, error by its sign, kinds."""
+"""Views of a result beside their true depth: image, both depths, signed error, kinds of region."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,25 +11,25 @@ from geogs_bench.results.record import Place
 from geogs_bench.scoring.depth_scores import ComparedView
 
 DEPTH_PICTURE = "bench_depth.png"
-"""In the report of a result."""
+"""File in the report of a result."""
 DEPTH_TITLE = (
     "image; true depth; depth of the mesh; error up to 15 % (red in front, blue behind, black "
     "missing, grey not judged); places (yellow edge, magenta thin, cyan behind thin, green bare, "
     "orange grazing, blue sky)"
 )
 _WORST = 0.15
-"""Relative error of the full colours."""
+"""Relative error at which colours saturate."""
 _FRONT, _BEHIND = (200, 0, 0), (0, 60, 220)
 _MISSING, _UNKNOWN = (0, 0, 0), (128, 128, 128)
 _COLOURS: dict[Place, tuple[int, int, int]] = {
     "bare": (90, 190, 90), "grazing": (240, 150, 40), "edge": (240, 230, 60),
     "behind thin": (60, 210, 220), "thin": (230, 40, 210), "sky": (80, 120, 230),
 }  # fmt: skip
-"""Later ones are drawn over earlier ones."""
+"""Colours of the kinds of region; later ones are drawn over earlier ones."""
 
 
 def draw_depths(path: Path, views: Sequence[ComparedView], most: int = 5) -> None:
-    """A row for each of some views, spread over the sequence.
+    """Draw a row for each of some views, spread over the sequence.
 
     Raises:
         OutputError: the file cannot be written.
@@ -55,7 +55,7 @@ def _row(compared: ComparedView) -> UInt8[np.ndarray, "h w2 3"]:
 def _depth_colours(
     depth: Float[np.ndarray, "h w"], ends: Float[np.ndarray, "2"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Inverse depth from far (blue) to near (red); black where there is none."""
+    """Colours of inverse depth from far (blue) to near (red); black where there is none."""
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
     return depth_colours(inverse, float(ends[0]), float(ends[1]), background=0)
 
@@ -63,9 +63,9 @@ def _depth_colours(
 def error_colours(
     true: Float[np.ndarray, "h w"], found: Float[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """White where the depth is right, red where it is too near, blue where it is too far.
+    """Colours of the error: white where the depth is right, red too near, blue too far.
 
-    Black are holes, but in the sky, where a hole is right and a surface in front of it.
+    Holes are black, but in the sky, where a hole is right and a surface is too near.
     """
     sky, unknown, hole = np.isinf(true), ~(true > 0), ~np.isfinite(found)
     depth = np.where(sky | unknown, 1.0, true)

@@ -1,7 +1,7 @@
-"""Depth of a result's mesh against the true one in views of its sequence, by kind of place.
+"""Depth of a result's mesh against the true one in views of its sequence, by kind of region.
 
-The mesh is seen from the estimated poses, after one scale for the whole sequence, so that errors of
-the trajectory, which other benchmarks measure, do not shift its edges.
+The mesh is rendered from the estimated poses, with one scale for the whole sequence, so that errors
+of the trajectory, which other benchmarks measure, do not shift its edges.
 """
 
 from collections.abc import Sequence
@@ -21,31 +21,31 @@ from geogs_bench.scoring.plane_fits import fit_planes
 from geogs_bench.scoring.true_depths import TrueView, pose_at, read_true_depths
 
 VIEWS = 25
-"""Frames that are compared, about."""
+"""Approximate number of compared frames."""
 NEAR, FAR = 0.02, 0.05
-"""Relative errors."""
+"""Relative errors of the two ratios."""
 _EXACT_WINDOW, _SENSOR_WINDOW = 7, 21
-"""Pixels of the planes whose normals are compared."""
+"""Sides of the planes whose normals are compared, pixels."""
 _EXACT_TOLERANCE, _SENSOR_TOLERANCE = 0.003, 0.006
-"""Deviation from these planes, as a part of the depth."""
+"""Largest RMS residual of these planes, as a fraction of the depth."""
 
 
 @dataclass(frozen=True)
 class ComparedView:
-    """A view with the depth that is, the depth that was found, and the kinds of its places."""
+    """A view with its true depth, the estimated depth, and the kinds of its regions."""
 
     view: TrueView
     found: Float32[np.ndarray, "h w"]
-    """z in metres; infinite where the mesh has a hole."""
+    """Estimated z in metres; infinite where the mesh has a hole."""
     places: dict[Place, Bool[np.ndarray, "h w"]]
     angle: Float32[np.ndarray, "h w"]
-    """Degrees between the normals; not a number where either is not known."""
+    """Angle between the normals, degrees; NaN where either is unknown."""
 
 
 def score_depth(
     scene: BenchmarkScene, result: ResultFolder
 ) -> tuple[tuple[PlaceScore, ...], list[ComparedView]]:
-    """The scores of every kind of place that there is, and the views behind them.
+    """The scores of every kind of region that occurs, and the compared views.
 
     Raises:
         InputError: the result has no mesh or no poses, or the sequence no true depth.
@@ -73,7 +73,7 @@ def score_depth(
 def one_scale(
     true: Sequence[Float[np.ndarray, "h w"]], found: Sequence[Float[np.ndarray, "h w"]]
 ) -> list[Float32[np.ndarray, "h w"]]:
-    """The depths that were found, in metres: times the median of true over found, of all views.
+    """Scale the estimated depths to metres, by the median of true over estimated in all views.
 
     Raises:
         InputError: there is no pixel where both are known.
@@ -96,11 +96,11 @@ def compare_view(
     window: int,
     tolerance: float,
 ) -> ComparedView:
-    """The kinds of a view's places, and the error of its normals where they are known.
+    """The kinds of a view's regions, and the error of its normals where they are known.
 
     ``cameras`` are the true one and the result's, of the same pixels. Both normals are of planes of
-    ``window`` x ``window`` pixels; the true one has to fit to ``tolerance``, the found one is taken
-    as it is.
+    ``window`` x ``window`` pixels; the true plane has to fit to ``tolerance``, the estimated one
+    need not.
     """
     true_fits, own_fits = (fit_planes(depth, window, tolerance) for depth in (view.depth, found))
     cosine = (true_fits.normals(cameras[0]) * own_fits.normals(cameras[1])).sum(-1)
@@ -111,7 +111,7 @@ def compare_view(
 
 
 def place_scores(views: Sequence[ComparedView]) -> tuple[PlaceScore, ...]:
-    """The scores of each kind of place over all views; kinds that no view has are left out."""
+    """The scores of each kind of region over all views; kinds that no view has are left out."""
     true, found, angle = (
         np.concatenate([a.ravel() for a in arrays])
         for arrays in (

@@ -1,4 +1,4 @@
-"""How well a camera's motion was followed: fraction of the frames, positions, orientations."""
+"""Scores of a camera's estimated motion: fraction of the frames, positions, orientations."""
 
 from dataclasses import replace
 
@@ -20,17 +20,17 @@ from geogs_bench.results.record import MotionScore
 from geogs_bench.results.result_folder import ResultFolder
 
 _LEAST_PATH = 0.05
-"""Metres of way below which positions have nothing to be compared with."""
+"""Least length of the path for a comparison of positions, metres."""
 _MOST_OFF = 0.05
-"""ATE of a reliable run, of the extent of the true path (root of the mean squared distance from its
-middle)."""
+"""Largest ATE of a reliable run, as a fraction of the extent of the true path (root of the mean
+squared distance from its middle)."""
 _LEAST_FOLLOWED = 80.0
-"""Percent of the frames of which a reliable run knows the pose, or says that it is no more than the
-orientation."""
+"""Least percentage of frames of which a reliable run gives the pose, or the orientation marked as
+such."""
 
 
 def score_motion(scene: BenchmarkScene, result: ResultFolder) -> MotionScore:
-    """The final trajectory of a result against the scene's true one.
+    """Score the final trajectory of a result against the scene's true one.
 
     Raises:
         InputError: either cannot be read.
@@ -53,11 +53,11 @@ def score_motion(scene: BenchmarkScene, result: ResultFolder) -> MotionScore:
 
 
 def compare_motion(reference: Trajectory, tracked: Trajectory, oriented: Trajectory) -> MotionScore:
-    """The poses that were tracked against the true ones, frame by frame.
+    """Compare the tracked poses with the true ones, frame by frame.
 
-    Positions are aligned by a Sim(3), orientations by the rotation that fits them best, so that a
-    camera that only turns has a rotation error, too. ``oriented`` are the poses whose
-    orientation counts.
+    Positions are aligned by a Sim(3), orientations by the best-fitting rotation, so that a camera
+    that only rotates has a rotation error, too. ``oriented`` are the poses whose orientation
+    counts.
     """
     reference, tracked, oriented = map(finite_poses, (reference, tracked, oriented))
     i, j = associate(reference.timestamps, tracked.timestamps, SAME_TIME)
@@ -78,12 +78,12 @@ def compare_motion(reference: Trajectory, tracked: Trajectory, oriented: Traject
 
 
 def is_near(ate_cm: float, T_wc: Float[np.ndarray, "n 4 4"]) -> bool:
-    """Whether an ATE is that of a reliable run; ``T_wc`` are the true poses, in metres."""
+    """Whether an ATE is small enough for a reliable run; ``T_wc`` are the true poses, in metres."""
     return ate_cm <= 100 * _MOST_OFF * extent_of(T_wc)
 
 
 def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
-    """RMSE of the orientations in degrees; none where there are fewer than three."""
+    """RMSE of the orientations in degrees; none if there are fewer than three."""
     i, j = associate(reference.timestamps, oriented.timestamps, SAME_TIME)
     if len(i) < 3:
         return None
@@ -93,7 +93,7 @@ def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
 def _within(
     reference: Trajectory, tracked: Trajectory, states: list[tuple[float, str, float]]
 ) -> float | None:
-    """Percent of the positions that are off by no more than three deviations, aligned."""
+    """Percent of the aligned positions with errors of at most three standard deviations."""
     try:
         errors = evaluate_trajectory(tracked, reference, SAME_TIME)
     except InputError:

@@ -1,6 +1,6 @@
-"""Kinds of place in a view, by its true depth and its image alone: edges, thin things, bare walls.
+"""Kinds of region in a view, by its true depth and its image alone: edges, thin things, bare walls.
 
-A jump of depth, here and everywhere below, is a part of the farther depth: 1 - near / far.
+A jump of depth is given as a fraction of the farther depth: 1 - near / far.
 """
 
 import cv2
@@ -12,22 +12,22 @@ from geogs_bench.results.record import Place
 from geogs_bench.scoring.plane_fits import PlaneFits
 
 JUMP = 0.05
-"""Least jump of depth of an edge, and between a thin thing and what is behind it."""
+"""Least jump of depth of an edge, and between a thin thing and its background."""
 NEAR_EDGE = 5
 """Pixels to either side of a jump that belong to the edge."""
 THIN, LONG = 13, 20
-"""Pixels: a thin thing leaves no room for a square of such a side, and is so long at least."""
+"""Side of the square that does not fit into a thin thing, and its least length, pixels."""
 BEHIND = 20
-"""Pixels around a thin thing in which what is farther than it counts as behind it."""
+"""Pixels around a thin thing in which farther pixels count as behind it."""
 BARE = 1.0
-"""Grey levels a pixel, root mean square over 9 x 9 pixels of the smoothed image: a smaller gradient
-is bare. Plain walls of photographs have 0.3 to 0.9, of shading and of what noise is left."""
+"""Largest gradient of a bare region: grey levels a pixel, root mean square over 9 x 9 pixels of the
+smoothed image. Plain walls of photographs have 0.3 to 0.9, from shading and residual noise."""
 GRAZING = 75.0
-"""Degrees between the normal and the ray."""
+"""Least angle between the normal and the ray of a grazing view, degrees."""
 _LONGEST_GAP = 32
-"""Pixels without depth across which a jump is told: the shadow of a sensor beside an edge."""
+"""Most pixels without depth across which a jump is detected: a sensor's shadow at an edge."""
 _SMOOTHING = 2.0
-"""Pixels; deviation of the blur that takes noise and JPEG's blocks from the image."""
+"""Standard deviation of the blur that removes noise and JPEG's blocks, pixels."""
 _PATCH = 9
 
 
@@ -37,10 +37,10 @@ def places_of(
     camera: Camera,
     fits: PlaneFits,
 ) -> dict[Place, Bool[np.ndarray, "h w"]]:
-    """Which pixels are of which kind.
+    """Masks of the pixels of each kind.
 
     Args:
-        depth: true z; 0 where nothing is known of it, infinite in the sky.
+        depth: true z; 0 where it is unknown, infinite in the sky.
         image: RGB.
         camera: of both.
         fits: planes of ``depth``.
@@ -61,13 +61,13 @@ def places_of(
 
 
 def inverse_depth(depth: Float[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """1 / z; 0 in the sky, not a number where nothing is known."""
+    """1 / z; 0 in the sky, NaN where it is unknown."""
     with np.errstate(divide="ignore"):
         return np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
 
 
 def edges(inverse: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels at either end of a jump along a row or a column that no plane explains."""
+    """Mask of the pixels at either end of a jump, along a row or column, that no plane explains."""
     found = np.zeros(inverse.shape, bool)
     for line, marks in (*zip(inverse, found, strict=True), *zip(inverse.T, found.T, strict=True)):
         _mark_jumps(line, marks)
@@ -75,9 +75,9 @@ def edges(inverse: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _mark_jumps(line: Float64[np.ndarray, "n"], marks: Bool[np.ndarray, "n"]) -> None:
-    """Mark neighbours of one line that differ, and go on neither as before nor as after.
+    """Mark neighbours of one line whose step fits the slope neither before nor after it.
 
-    Inverse depth is linear along a plane, so the slope on either side says what the plane explains.
+    Inverse depth is linear along a plane, so the slope on either side predicts the plane's step.
     """
     at = np.flatnonzero(~np.isnan(line))
     if len(at) < 2:
@@ -94,9 +94,9 @@ def _mark_jumps(line: Float64[np.ndarray, "n"], marks: Bool[np.ndarray, "n"]) ->
 
 
 def thin_things(inverse: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """What an opening of the inverse depth takes away, where that is long.
+    """Mask of the long regions that an opening of the inverse depth removes.
 
-    Beyond the border, and where nothing is known, things are taken to go on.
+    Surfaces are assumed to continue beyond the border and where the depth is unknown.
     """
     square, half = np.ones((THIN, THIN), np.uint8), THIN // 2
     unknown = np.isnan(inverse)
@@ -106,21 +106,21 @@ def thin_things(inverse: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(narrow.astype(np.uint8))
     length = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
     is_long = length >= LONG
-    is_long[0] = False  # what is not narrow
+    is_long[0] = False  # the background
     return np.asarray(is_long[labels])
 
 
 def _behind(
     inverse: Float64[np.ndarray, "h w"], thin: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """What is farther than a thin thing nearby."""
+    """Mask of the pixels that are farther than a thin thing nearby."""
     side = 2 * BEHIND + 1
     nearest = cv2.dilate(np.where(thin, inverse, 0.0), np.ones((side, side), np.uint8))
     return np.asarray(~thin & (inverse < (1 - JUMP) * nearest))
 
 
 def bare(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels around which the image hardly changes."""
+    """Mask of the pixels around which the image hardly changes."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING)
     down, across = np.gradient(smooth)
@@ -129,6 +129,6 @@ def bare(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _widened(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
-    """The mask and what is at most so far from it along rows and columns."""
+    """The mask, dilated by ``pixels`` along rows and columns."""
     side = 2 * pixels + 1
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0

@@ -9,12 +9,12 @@ from jaxtyping import Bool, Float, Float64
 from geogs.geometry.camera import Camera
 
 _LEAST_KNOWN = 0.8
-"""Part of a neighbourhood that has to have depth."""
+"""Least fraction of a neighbourhood with depth."""
 
 
 @dataclass(frozen=True)
 class PlaneFits:
-    """The plane around every pixel, as its inverse depth: linear in the pixel's place."""
+    """The plane around every pixel, as its inverse depth: linear in the pixel's position."""
 
     value: Float64[np.ndarray, "h w"]
     """Inverse depth at the pixel; 1 where there is no plane."""
@@ -23,14 +23,14 @@ class PlaneFits:
     down: Float64[np.ndarray, "h w"]
     """Growth of inverse depth to the next row; 0 where there is no plane."""
     is_known: Bool[np.ndarray, "h w"]
-    """Whether enough of the neighbourhood has depth."""
+    """Mask: enough of the neighbourhood has depth."""
     is_good: Bool[np.ndarray, "h w"]
-    """Whether the neighbourhood, besides, is a plane."""
+    """Mask: the neighbourhood is also planar."""
 
     def normals(self, camera: Camera) -> Float64[np.ndarray, "h w 3"]:
         """Unit normals in the camera's frame, away from it.
 
-        With n . X = 1 on the plane, 1 / z = n . r on the ray r, and so its slopes are n_x / f_x and
+        With n . X = 1 on the plane, 1 / z = n . r on the ray r, so its slopes are n_x / f_x and
         n_y / f_y.
         """
         v, u = np.indices(self.value.shape)
@@ -39,19 +39,19 @@ class PlaneFits:
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
     def slant(self, camera: Camera) -> Float64[np.ndarray, "h w"]:
-        """Degrees between the normal and the pixel's ray."""
+        """Angle between the normal and the pixel's ray, degrees."""
         rays = camera.rays().double().numpy()
         cosine = (self.normals(camera) * rays).sum(-1) / np.linalg.norm(rays, axis=-1)
         return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def fit_planes(depth: Float[np.ndarray, "h w"], side: int, tolerance: float) -> PlaneFits:
-    """Least squares over ``side`` x ``side`` pixels around each.
+    """Fit planes by least squares over ``side`` x ``side`` pixels around each pixel.
 
     Args:
         depth: z; 0 or infinite where there is none.
         side: of the neighbourhood, odd, pixels.
-        tolerance: root mean square of the rest, as a part of the depth, up to which it is a plane.
+        tolerance: largest RMS residual of a plane, as a fraction of the depth.
     """
     known = (depth > 0) & np.isfinite(depth)
     weight = known.astype(np.float64)

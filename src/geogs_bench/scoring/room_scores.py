@@ -19,30 +19,30 @@ from geogs_bench.data.benchmark_scene import Truth
 from geogs_bench.results.record import SurfaceScore
 
 _CULLING_POSES = 200
-"""About so many true poses decide what the camera saw."""
+"""Approximate number of true poses that determine what the camera saw."""
 _LONGEST_EDGE = 0.05
-"""Metres; coarser true meshes are cut into smaller triangles."""
+"""Longest edge of a true mesh in metres; coarser ones are cut into smaller triangles."""
 _MOST_FACES = 4_000_000
 
 
 @dataclass(frozen=True)
 class TrueSurface:
-    """What a mesh is compared with."""
+    """The true surface for the comparison with a mesh."""
 
     whole: Surface
-    """The whole surface, against which accuracy is measured."""
+    """The whole surface, for accuracy."""
     seen: Surface
     """The part that the camera saw, for comparisons of whole meshes."""
     points: Surface | None
-    """Points that the camera saw, for completeness; none where ``seen`` serves."""
+    """Points that the camera saw, for completeness; none if ``seen`` is used."""
 
 
 def read_true_surface(
     truth: Truth, camera: Camera, T_cw: Float64[np.ndarray, "n 4 4"]
 ) -> TrueSurface | None:
-    """The surface of a scene, cut to what the camera saw from the true poses (world to camera).
+    """Read the surface of a scene, culled to the part seen from the true poses (world to camera).
 
-    None where the scene has no surface. Raises InputError if it cannot be read or none was seen.
+    None if the scene has no surface. Raises InputError if it cannot be read or none was seen.
     """
     if truth.surface is None:
         return None
@@ -51,7 +51,7 @@ def read_true_surface(
     if truth.culling == "done" or not whole.is_mesh:
         return TrueSurface(whole, whole, points)
     views = T_cw[:: max(1, len(T_cw) // _CULLING_POSES)]
-    # Culling looks at vertices, and a wall of two triangles has hardly any.
+    # Culling tests vertices, and a wall of two triangles has hardly any.
     fine = with_short_edges(whole, _LONGEST_EDGE)
     seen = cull_mesh(fine, camera, views, truth.culling, whole)
     return TrueSurface(whole, seen, points)
@@ -60,9 +60,9 @@ def read_true_surface(
 def score_surface(
     mesh: Surface, truth: TrueSurface, use_icp: bool, seed: int
 ) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
-    """Vertex-weighted and, last, area-weighted scores in cm, and where the mesh is wrong.
+    """Vertex-weighted and, last, area-weighted scores in cm, and the errors over the mesh.
 
-    ``use_icp`` moves the mesh rigidly by ICP (0.1 m) before, as the scripts of the SLAM tables do.
+    ``use_icp`` first aligns the mesh rigidly by ICP (0.1 m), as the scripts of the SLAM tables do.
     A truth without triangles has no vertex-weighted score.
     """
     area = evaluate_reconstruction(
@@ -77,7 +77,7 @@ def score_surface(
 
 
 def in_cm(weighting: Literal["area", "vertices"], scores: ReconstructionScores) -> SurfaceScore:
-    """The record of scores in cm."""
+    """Convert scores to a record in cm."""
     return SurfaceScore(
         weighting=weighting,
         unit="cm",
@@ -94,7 +94,7 @@ def in_cm(weighting: Literal["area", "vertices"], scores: ReconstructionScores) 
 
 
 def with_short_edges(mesh: Surface, longest: float) -> Surface:
-    """The same surface, triangles halved across their longest edge until none is too long.
+    """Halve triangles across their longest edge until no edge is too long.
 
     Halving keeps thin triangles few. Neighbours that are halved across their common edge share
     the new corner; a neighbour that is not keeps that edge whole.
@@ -106,7 +106,7 @@ def with_short_edges(mesh: Surface, longest: float) -> Surface:
         long = np.flatnonzero(lengths.max(1) > longest)
         if not len(long) or len(faces) + len(long) > _MOST_FACES:
             return Surface(vertices, faces)
-        # Turn each triangle so that its longest edge is the one from a to b.
+        # Rotate the corners of each triangle so that its longest edge is the one from a to b.
         order = lengths[long].argmax(1)[:, None] + np.arange(3)
         a, b, c = np.take_along_axis(faces[long], order % 3, axis=1).T
         key = np.minimum(a, b) * len(vertices) + np.maximum(a, b)

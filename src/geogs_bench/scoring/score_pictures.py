@@ -16,11 +16,11 @@ PICTURES = {
     "bench_trajectory.png": "trajectory",
     "keyframes.png": "renders",
 }
-"""File in the report of a result, and title, of everything that a benchmark shows of it."""
+"""File in the report of a result, and title, of every picture of a benchmark."""
 
 
 def draw(stages: Sequence[StageErrors], result: ResultFolder) -> None:
-    """Draw what the errors of the last stage allow, seen from its own cameras.
+    """Draw the pictures that the errors of the last stage allow, seen from its own cameras.
 
     Raises:
         OutputError: they cannot be written.

@@ -25,7 +25,7 @@ _LONG_EDGE = 800
 
 
 def scored(record: Record, scene: BenchmarkScene, result: ResultFolder) -> Record:
-    """The record of a run with the scores of its result, drawn beside the truth in its report.
+    """Add the scores of a result to the record of its run, and draw it beside the truth.
 
     Raises:
         InputError: the result or the truth cannot be read, or they do not fit each other.
@@ -52,7 +52,7 @@ def scored(record: Record, scene: BenchmarkScene, result: ResultFolder) -> Recor
 
 
 def score_posed(scorer: SurfaceScorer, result: ResultFolder) -> list[StageErrors]:
-    """Every stage that left a mesh. Raises InputError where none did."""
+    """Score every stage that has a mesh. Raises InputError if none has."""
     stages = []
     for stage in result.stages():
         mesh = result.mesh(stage)
@@ -65,7 +65,7 @@ def score_posed(scorer: SurfaceScorer, result: ResultFolder) -> list[StageErrors
 
 
 def score_snapshots(scorer: SurfaceScorer, result: ResultFolder) -> tuple[CurvePoint, ...]:
-    """Errors of the map after so many seconds, where the run left such snapshots."""
+    """Errors of the map over time, if the run left snapshots."""
     points = []
     for seconds, folder in result.snapshots():
         mesh = read_surface(folder / "mesh.ply")
@@ -80,7 +80,7 @@ def _disks_of(folder: Path) -> int | None:
 
 
 def score_photo(scene: BenchmarkScene, result: ResultFolder) -> PhotoScore:
-    """Measured in the images that the run did not use (``held_out`` of its summary).
+    """Photo-consistency in the images that the run did not use (``held_out`` of its summary).
 
     Raises:
         InputError: the run used all images, or left no mesh, or no two views can be compared.
@@ -101,7 +101,7 @@ def score_photo(scene: BenchmarkScene, result: ResultFolder) -> PhotoScore:
 
 
 def _indices(source: PosedSource, listed: list[int | str]) -> list[int]:
-    """Places in the source of images that are listed by place or by file name."""
+    """Indices in the source of images that are listed by index or by file name."""
     names = {Path(source.label(i)).name: i for i in range(len(source))}
     found = [i if isinstance(i, int) else names.get(Path(i).name) for i in listed]
     return [i for i in found if i is not None and i < len(source)]

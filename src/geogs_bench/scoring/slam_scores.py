@@ -21,7 +21,7 @@ from geogs_bench.scoring.room_scores import (
 
 @dataclass(frozen=True)
 class StageErrors:
-    """A stage with everything behind its scores."""
+    """A stage with the errors behind its scores."""
 
     score: StageScore
     trajectory: TrajectoryErrors | None = None
@@ -29,10 +29,10 @@ class StageErrors:
 
 
 def score_slam(scene: BenchmarkScene, result: ResultFolder, seed: int) -> list[StageErrors]:
-    """Every stage that left something, against the truth of the scene.
+    """Score every stage with files against the truth of the scene.
 
-    Each is aligned by the Sim(3) of its own trajectory over all frames; surfaces then get a rigid
-    ICP, as the scripts behind the published tables do.
+    Each is aligned by the Sim(3) of its own trajectory over all frames; surfaces are then refined
+    by a rigid ICP, as in the scripts behind the published tables.
 
     Raises:
         InputError: the truth or the result cannot be read, or they have no poses in common.
@@ -73,7 +73,7 @@ def _stage(
 
 
 def _ate(keyframes: Trajectory | None, reference: Trajectory) -> float | None:
-    """RMSE in cm; none where too few keyframes match to align them."""
+    """RMSE in cm; none if too few keyframes match to align them."""
     try:
         return None if keyframes is None else evaluate_trajectory(keyframes, reference).ate_rmse_cm
     except InputError:

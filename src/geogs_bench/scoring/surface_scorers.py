@@ -1,4 +1,4 @@
-"""Scorers of meshes that are in the truth's frame already: of a room, an object, a DTU scan."""
+"""Scorers of meshes in the frame of the truth: of a room, an object, a DTU scan."""
 
 from collections.abc import Callable
 
@@ -24,14 +24,14 @@ from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.room_scores import read_true_surface, score_surface
 
 SurfaceScorer = Callable[[Surface], tuple[tuple[SurfaceScore, ...], SurfaceComparison]]
-"""Scores of a mesh (the one to plot last) and where it is wrong."""
+"""Scores of a mesh (the one to plot last) and its errors over the surface."""
 
 _MASK_EDGE = 1600
-"""Pixels; DTU's masks are of this size."""
+"""Long edge of DTU's masks, pixels."""
 
 
 def surface_scorer(scene: BenchmarkScene, result: ResultFolder, seed: int) -> SurfaceScorer | None:
-    """The scorer of a scene, its truth read once; none where the scene has no true surface.
+    """The scorer of a scene, its truth read once; none if the scene has no true surface.
 
     Raises:
         InputError: the truth cannot be read.
@@ -85,7 +85,7 @@ def _scan_scorer(scene: BenchmarkScene, seed: int) -> SurfaceScorer:
 
 
 def _masks(scene: BenchmarkScene) -> list[Silhouette]:
-    """The masks of all images, widened as DTU's protocol does; empty where images have none."""
+    """The masks of all images, dilated by DTU's protocol; empty if images have none."""
     source = open_posed_source(scene.source, InputConfig(long_edge=_MASK_EDGE))
     return [mask.dilated() for mask in silhouettes(source) or ()]
 

@@ -23,21 +23,21 @@ from geogs_bench.data.true_poses import SAME_TIME, read_true_poses
 from geogs_bench.results.result_folder import ResultFolder
 
 _SENSOR_REACH = 5.0
-"""Metres beyond which a sensor's depth is not believed."""
+"""Largest depth of a sensor that is used, metres."""
 _OUTDOORS = ("driving",)
-"""Motions of ``geogs synth`` below a sky, where what has no depth is sky."""
+"""Motions of ``geogs synth`` under a sky: pixels without depth are sky."""
 
 
 @dataclass(frozen=True)
 class TrueView:
-    """A frame whose depth is known."""
+    """A frame with known depth."""
 
     index: int
     """Number of the frame in the sequence."""
     timestamp: float
     image: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]
-    """z; 0 where it is not known, infinite in the sky."""
+    """z; 0 where it is unknown, infinite in the sky."""
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,19 @@ class TrueDepths:
 
     views: list[TrueView]
     camera: Camera
-    """Camera of the data set where it says one; else of the result."""
+    """Camera of the data set if it gives one; else of the result."""
     is_exact: bool
-    """Whether it was rendered; else a sensor measured it."""
+    """Whether the depth was rendered; else a sensor measured it."""
 
 
 def read_true_depths(
     scene: BenchmarkScene, result: ResultFolder, poses: Trajectory, most: int
 ) -> TrueDepths:
-    """About ``most`` frames, spread over the sequence, whose pose was estimated.
+    """Read the depth of about ``most`` frames with an estimated pose, spread over the sequence.
 
     Args:
         scene: with depth images beside its frames, else with true poses and a true surface.
-        result: whose pixels the depths are wanted for.
+        result: the depths are given for its pixels.
         poses: of the result; frames without one are left out.
         most: frames.
 
@@ -75,7 +75,7 @@ def read_true_depths(
 
 
 def _opened(scene: BenchmarkScene, result: ResultFolder) -> Source:
-    """The sequence at the size of the result's images, by its own calibration if it has one."""
+    """Open the sequence at the size of the result's images, with its calibration if it has one."""
     camera = result.camera
     config = InputConfig(long_edge=camera.long_edge, depth="auto")
     source = open_source(scene.source, config)
@@ -92,7 +92,7 @@ def _opened(scene: BenchmarkScene, result: ResultFolder) -> Source:
 
 
 def spread(frames: list[Frame], most: int) -> list[Frame]:
-    """At most so many, equally far from each other, from the middle of the first part."""
+    """At most ``most`` frames at equal distances, beginning in the middle of the first interval."""
     count = min(most, len(frames))
     places = ((np.arange(count) + 0.5) * len(frames) / max(count, 1)).astype(int)
     return [frames[place] for place in places]
@@ -142,14 +142,14 @@ def pose_at(poses: Trajectory, timestamp: float) -> Float64[np.ndarray, "4 4"]:
 
 
 def _is_outdoors(folder: Path) -> bool:
-    """Whether ``geogs synth`` says that there is a sky."""
+    """Whether the scene of ``geogs synth`` has a sky."""
     file = folder / "cam_params.json"
     document: Any = read_json(file) if file.is_file() else None
     return isinstance(document, dict) and document.get("motion") in _OUTDOORS
 
 
 def _moving(folder: Path, frame: Frame) -> np.ndarray | bool:
-    """Pixels where ``geogs synth`` shows something that moves, which is in no map."""
+    """Mask of the moving bodies of ``geogs synth``, which are in no map."""
     mask = decoded(folder / "results" / f"moving{frame.index:06d}.png", cv2.IMREAD_GRAYSCALE)
     if mask.picture is None:
         return False

@@ -1,4 +1,4 @@
-"""What a benchmark leaves in its folder: results.json, results.md and report/index.html."""
+"""Files of a benchmark's folder: results.json, results.md and report/index.html."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,9 +26,9 @@ class Chapter:
 
     benchmark: Benchmark
     records: Sequence[Record]
-    """Their folders are relative to that of the whole report."""
+    """Records, with folders relative to that of the whole report."""
     prefix: str = ""
-    """Before the titles of its tables, where a report has several benchmarks."""
+    """Prefix of the titles of its tables, if a report has several benchmarks."""
 
 
 def write_report(output: Path, title: str, chapters: Sequence[Chapter]) -> None:
@@ -46,13 +46,13 @@ def write_report(output: Path, title: str, chapters: Sequence[Chapter]) -> None:
 
 
 def chapter_tables(chapter: Chapter) -> list[Table]:
-    """All its tables with a number."""
+    """All tables of a chapter that have a number."""
     tables = result_tables(chapter.benchmark, chapter.records)
     return [replace(table, title=chapter.prefix + table.title) for table in tables]
 
 
 def markdown(benchmark: Benchmark, records: Sequence[Record]) -> str:
-    """All tables, ours first, the paper's figures last, and how ours came about."""
+    """The provenance and all tables, ours first, the paper's figures last."""
     parts = [f"# {benchmark.title}", *_provenance(records)]
     if benchmark.published:
         parts.append(f"Columns marked (paper) hold the published figures of {PAPER}.")
@@ -63,7 +63,7 @@ def markdown(benchmark: Benchmark, records: Sequence[Record]) -> str:
 
 
 def _provenance(records: Sequence[Record]) -> list[str]:
-    """One line for each machine, device, commit and seed that took part."""
+    """One line for each combination of machine, device, commit and seed."""
     made = dict.fromkeys(
         f"Measured on {p.machine}; device {p.device or 'unknown'}; geogs {p.commit}; seed {p.seed}."
         for r in records
@@ -75,8 +75,8 @@ def _provenance(records: Sequence[Record]) -> list[str]:
 
 
 def _sections(output: Path, chapter: Chapter) -> list[Section]:
-    """Tables, curves, notes, what papers printed, pictures; among several benchmarks the notes
-    come first, under the benchmark's title."""
+    """Tables, curves, notes, published figures, pictures; among several benchmarks the notes come
+    first, under the benchmark's title."""
     benchmark, prefix = chapter.benchmark, chapter.prefix
     sections: list[Section] = [_section(table) for table in chapter_tables(chapter)]
     curves = output / "report" / f"{benchmark.name}-convergence.png"
@@ -100,7 +100,7 @@ def _section(table: Table) -> TableSection:
 
 
 def plot_curves(path: Path, records: Sequence[Record]) -> bool:
-    """Chamfer distance over seconds, a panel for each scene; false if no record has a curve."""
+    """Plot Chamfer distance over seconds, a panel a scene; return whether a record has a curve."""
     scenes = list(dict.fromkeys(record.scene for record in records if record.curve))
     if not scenes:
         return False

@@ -15,7 +15,7 @@ from geogs_bench.results.record import (
 )
 
 Value = Callable[[Record], float | None]
-"""What a column shows of a record."""
+"""Value of a column for a record."""
 
 _MEASURES = (
     ("Acc", "accuracy", "{unit}"),
@@ -40,7 +40,7 @@ _POSED: tuple[StageName, ...] = ("depth fusion", "final")
 
 
 def _of(found: Callable[[Record], object], name: str, factor: float = 1.0) -> Value:
-    """A field of what is found in a record, times ``factor``; none where nothing is."""
+    """A field of the object that ``found`` returns for a record, times ``factor``, or none."""
 
     def value(record: Record) -> float | None:
         scored = found(record)
@@ -89,9 +89,9 @@ def trajectory_layout(published: PublishedTable | None = None) -> Layout:
 def rgbd_layout(
     variant: str, published: PublishedTable | None = None, methods: Sequence[str] = ()
 ) -> Layout:
-    """ATE of results in metres beside published figures of systems that were given depth, too.
+    """ATE of results in metres beside published figures of systems with sensor depth.
 
-    The published stand in the rows of a ``variant``; all methods of the table if none is named.
+    The published figures are in the rows of a ``variant``; all methods if none is named.
     """
     if published is not None and not methods:
         methods = [row.method for row in published.rows]
@@ -120,7 +120,7 @@ def surface_layout(
     published: PublishedTable | None = None,
     posed: bool = False,
 ) -> Layout:
-    """Errors of the surface at each stage; published figures beside those of the paper's stage.
+    """Errors of the surface at each stage, with published figures beside the paper's stage.
 
     From known poses (``posed``) there is one stage, the result.
     """
@@ -146,23 +146,23 @@ def _beside(published: PublishedTable | None, metric: str) -> Published | None:
 
 
 def vertex_layout(published: PublishedTable | None = None, posed: bool = False) -> Layout:
-    """The vertex-weighted measure of the published SLAM tables."""
+    """Errors by the vertex-weighted measure of the published SLAM tables."""
     title = "Surface, vertex-weighted (toolbox of Splat-SLAM)"
     return surface_layout("vertices", title, published, posed)
 
 
 def area_layout(posed: bool = False) -> Layout:
-    """The measure that depends neither on tessellation nor on sampling."""
+    """Errors by the measure that depends neither on tessellation nor on sampling."""
     return surface_layout("area", "Surface, area-weighted, exact distances", None, posed)
 
 
 def dtu_layout(published: PublishedTable | None = None) -> Layout:
-    """DTU's protocol."""
+    """Errors by DTU's protocol."""
     return surface_layout("points", "Surface, DTU's protocol", published, posed=True)
 
 
 def photo_layout() -> Layout:
-    """Agreement of held-out images."""
+    """Photo-consistency of held-out images."""
     return Layout(
         "Photo-consistency of held-out views across the mesh",
         (
@@ -177,7 +177,7 @@ def photo_layout() -> Layout:
 
 
 def motion_layout() -> Layout:
-    """How every motion was followed."""
+    """Scores of every motion."""
     return Layout(
         "Motions",
         (
@@ -212,11 +212,11 @@ _PLACES: tuple[tuple[str, str, str, int], ...] = (
     ("Median error of the normals (degrees)", "normal", "", 1),
     ("Share of all pixels whose depth is known (%)", "share", "Kinds overlap.", 2),
 )  # fmt: skip
-"""Title, field, note and digits of every table of depth by kind of place."""
+"""Title, field, note and digits of every table of depth by kind of region."""
 
 
 def place_layouts() -> tuple[Layout, ...]:
-    """A table for each measure of depth, with a column for each kind of place."""
+    """A table for each measure of depth, with a column for each kind of region."""
     return tuple(
         Layout(title, tuple(Column(p, place(p, name), digits) for p in PLACES), note)
         for title, name, note, digits in _PLACES
@@ -224,12 +224,12 @@ def place_layouts() -> tuple[Layout, ...]:
 
 
 def place(kind: Place, name: str) -> Value:
-    """A field of the scores of a kind of place."""
+    """A field of the scores of a kind of region."""
     return _of(lambda record: record.place(kind), name)
 
 
 def efficiency_layout(published: PublishedTable) -> Layout:
-    """How large the model is, and how good; published figures beside ours."""
+    """Size and error of the model, with published figures beside ours."""
 
     def column(title: str, metric: str, value: Value, digits: int) -> Column:
         return Column(title, value, digits, Published(published, metric))
@@ -247,7 +247,7 @@ def efficiency_layout(published: PublishedTable) -> Layout:
 
 
 def curve_layout(seconds: Sequence[int]) -> Layout:
-    """Error of the surface as it stood after so many seconds, and of the result."""
+    """Error of the surface after ``seconds``, and of the result."""
 
     def after(moment: int) -> Value:
         return _of(lambda r: next((p.surface for p in r.curve if p.seconds == moment), None),
@@ -259,7 +259,7 @@ def curve_layout(seconds: Sequence[int]) -> Layout:
 
 
 def _surface_of_result(record: Record) -> SurfaceScore | None:
-    """By DTU's protocol where that was measured, else area-weighted."""
+    """Score of the result, by DTU's protocol if that was measured, else area-weighted."""
     final = record.stage("final")
     return None if final is None else final.surface("points") or final.surface("area")
 

@@ -8,18 +8,18 @@ from geogs_bench.published import PublishedTable
 from geogs_bench.results.record import Record
 
 MISSING = "–"
-"""Cell of a number that is not there."""
+"""Cell of a missing number."""
 _BESIDE = " (paper)"
-"""What the title of a column of published figures ends with."""
+"""Ending of the title of a column of published figures."""
 _OF_PAPER = "paper"
-"""Name of the variant that has the paper's settings, or what its name begins with."""
+"""Name of the variant with the paper's settings, or the beginning of its name."""
 _SECONDS = "120s"
-"""The time that the paper gives a reconstruction from known poses."""
+"""The paper's time for a reconstruction from known poses."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Text in cells; the first column names a row."""
+    """Cells of text; the first column names the row."""
 
     title: str
     header: tuple[str, ...]
@@ -27,14 +27,14 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """The table as GitHub's Markdown has it, under its title."""
+        """The table in GitHub's Markdown, under its title."""
         lines = [self.header, ("---", *["---:"] * (len(self.header) - 1)), *self.rows]
         text = "\n".join(f"| {' | '.join(map(_escape, cells))} |" for cells in lines)
         return "\n\n".join(part for part in (f"## {self.title}", text, self.note) if part)
 
 
 def result_tables(benchmark: Benchmark, records: Sequence[Record]) -> list[Table]:
-    """All tables of a benchmark that have a number; the first one names also what failed."""
+    """All tables of a benchmark that have a number, after one of the failures, if there are any."""
     made = []
     scored = [record for record in records if record.cost is not None]
     for layout in benchmark.layouts:
@@ -49,7 +49,7 @@ def result_tables(benchmark: Benchmark, records: Sequence[Record]) -> list[Table
 
 
 def published_tables(benchmark: Benchmark) -> list[Table]:
-    """Papers' tables as printed; nothing in them was measured here."""
+    """Tables as printed in papers; nothing in them was measured here."""
     return [_published_table(table) for table in benchmark.published]
 
 
@@ -92,7 +92,7 @@ def _layout_tables(
 def _table(
     title: str, header: Sequence[str], rows: Sequence[Sequence[str]], note: str = ""
 ) -> Table:
-    """A table without the columns of published figures that none of its rows has."""
+    """Make a table without columns of published figures that are empty."""
     kept = [
         n
         for n, name in enumerate(header)
@@ -133,7 +133,7 @@ def _row(benchmark: Benchmark, record: Record, columns: Sequence[Column]) -> tup
 def _mean_row(
     benchmark: Benchmark, name: str, records: Sequence[Record], columns: Sequence[Column]
 ) -> tuple[str, ...]:
-    """Means over the records of a variant that have a number; how many, where some have none."""
+    """Means over the records of a variant that have a number; their count, if some have none."""
     cells = [name]
     for column in columns:
         values = [v for r in records if (v := column.value(r)) is not None]
@@ -149,8 +149,8 @@ def _mean_row(
 def _published_mean(
     benchmark: Benchmark, table: PublishedTable, metric: str, records: Sequence[Record]
 ) -> float | None:
-    """Value of the records' variant where the table has such columns (over all the paper's
-    scenes), else of their scenes; a mean alone only where all the paper's scenes are there."""
+    """Value of the records' variant if the table has such columns (over all the paper's scenes),
+    else of their scenes; a mean alone only if all the paper's scenes are there."""
     variant, scenes = records[0].variant, [r.scene for r in records]
     complete = set(benchmark.scenes) <= set(scenes) and bool(benchmark.scenes)
     of_variants = _columns_of_variants(benchmark, table)
@@ -165,8 +165,8 @@ def _published_mean(
 
 
 def _columns_of_variants(benchmark: Benchmark, table: PublishedTable) -> dict[str, str]:
-    """The column of an ablation's table for each variant that it belongs to: the one that has the
-    paper's other settings, too, where the benchmark has both."""
+    """The column of an ablation's table for each variant: for the variant with the paper's other
+    settings, too, if the benchmark has both."""
     names = {variant.name for variant in benchmark.variants}
     found = dict[str, str]()
     for column in table.columns:
@@ -177,8 +177,8 @@ def _columns_of_variants(benchmark: Benchmark, table: PublishedTable) -> dict[st
 
 
 def _is_papers(benchmark: Benchmark, variant: str) -> bool:
-    """Whether published figures of scenes belong to the rows of a variant: to those of the paper's
-    settings, where the benchmark has them, else of its first variant; in the paper's time."""
+    """Whether published figures of scenes belong to the rows of a variant: that of the paper's
+    settings, if the benchmark has it, else its first variant; in the paper's time."""
     names = [v.name for v in benchmark.variants]
     own = _OF_PAPER if _OF_PAPER in names else names[0]
     return variant in (own, f"{own}-{_SECONDS}".removeprefix("-"))

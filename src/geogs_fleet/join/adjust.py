@@ -1,8 +1,8 @@
-"""Bundle adjustment of all parts of a world together, of which no worker sees more than one.
+"""Bundle adjustment of all parts of a world together; each worker has only one part.
 
-What the matches of a part say of the poses, its depths eliminated, is small and is summed up here;
-the step of all poses goes back to the parts, which bring their depths after it. So it is one
-adjustment of everything, whose matches and depths stay in files.
+The normal equations of a part's poses, its depths eliminated, are small and are summed up here; the
+step of all poses goes back to the parts, which update their depths. So it is one adjustment of
+everything, whose matches and depths stay in files.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,25 +44,25 @@ _NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
 
 @dataclass(frozen=True)
 class StepJob:
-    """A part after a step of all poses: its depths are to follow, and what it says of the next."""
+    """Job of a part after a step of all poses: update its depths, form its next equations."""
 
     own: Member
     others: tuple[Member, ...]
-    """All parts that are linked to it."""
+    """All parts with links to this one."""
     first: Mapping[int, int]
-    """Number of the first keyframe of each of them in the whole."""
+    """Index of the first keyframe of each part among all keyframes."""
     matches: tuple[Path, ...]
-    """Files of the edges that leave its keyframes."""
+    """Files of the edges whose source is one of its keyframes."""
     camera: Camera
     config: Config
     after: Path
-    """File of the depths, to be written."""
+    """File to write the depths to."""
     T_before: Float[Tensor, "m 4 4"] | None
-    """Poses of all keyframes of the whole before the step; none where there was no step yet."""
+    """Poses of all keyframes before the step; none if there was no step yet."""
     step: Float[Tensor, "m 6"] | None
     """Step of their poses."""
     is_last: bool = False
-    """Nothing is said of the next; cells without matches are filled, and what moves is found."""
+    """Form no further equations; fill cells without matches, and find dynamic cells."""
 
 
 def adjusted(
@@ -75,10 +75,10 @@ def adjusted(
     workers: Workers,
     folder: Path,
 ) -> dict[int, Placement]:
-    """The keyframes of a world by all matches within its parts and between those that are linked.
+    """Adjust the keyframes of a world by all matches within its parts and between linked ones.
 
-    The first keyframe of the first part stays. Depths and matches are kept in ``folder``, which all
-    workers see.
+    The first keyframe of the first part is fixed. Depths and matches are kept in ``folder``, which
+    all workers can access.
     """
     now = {
         n: Member(n, parts[n], files[n], placements[n].T_cw, placements[n].scale)
@@ -95,7 +95,7 @@ def adjusted(
 
 @dataclass(frozen=True)
 class _Poses:
-    """The poses of all keyframes, and the step to them that the depths have not followed yet."""
+    """The poses of all keyframes, and the last step, which the depths have not followed yet."""
 
     T_cw: Float[Tensor, "m 4 4"]
     before: Float[Tensor, "m 4 4"] | None = None
@@ -120,20 +120,20 @@ class _Adjustment:
         self.first = dict(zip(members, counts[:-1], strict=True))
         self.keyframes = counts[-1]
         self.matches: dict[tuple[int, int], Path] = {}
-        """Edges that leave the keyframes of the second part, matched by the first."""
+        """Files of the edges that leave the keyframes of the second part, matched by the first."""
         self.ends = np.zeros((0, 4), np.int64)
         self.steps = 0
         """Number of steps of all poses so far."""
         self.written = 0
-        """Files so far, so that each gets a name of its own."""
+        """Number of files so far, so that each gets a unique name."""
 
     @property
     def pairs(self) -> int:
-        """Pairs of keyframes that are matched."""
+        """Number of matched pairs of keyframes."""
         return len(self.ends) // 2
 
     def match(self) -> int:
-        """Match what has moved; how many pairs."""
+        """Match the pairs that have moved; return their number."""
         jobs, written = [], []
         for n, own in self.members.items():
             later = [m for m in self.linked[n] if m > n]
@@ -150,15 +150,15 @@ class _Adjustment:
         return sum(f.fresh for f in found)
 
     def solve(self) -> None:
-        """Gauss-Newton steps until they are small, and the depths after the last of them."""
+        """Take Gauss-Newton steps until they are small, then update the depths."""
         poses = _AllPoses(self)
-        # What a step is worth nobody asks: that would be one more way through all files.
+        # The cost after a step is not evaluated: that would need another pass over all files.
         found = minimise(_Poses(self.poses()), poses.linearise, poses.step, GLOBAL_OPTIONS.policy)
         if found.finite:
             self.follow(found.state, is_last=True)
 
     def ends_of_edges(self) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
-        """Sources and targets by the numbers of the whole, sorted by source."""
+        """Indices of sources and targets among all keyframes, sorted by source."""
         first = np.zeros(max(self.first) + 1, np.int64)
         first[list(self.first)] = list(self.first.values())
         source, target = (first[self.ends[:, k]] + self.ends[:, k + 1] for k in (0, 2))
@@ -166,14 +166,14 @@ class _Adjustment:
         return torch.from_numpy(source[order]), torch.from_numpy(target[order])
 
     def place(self, T_cw: Float[Tensor, "m 4 4"]) -> None:
-        """Give all keyframes other poses."""
+        """Set the poses of all keyframes."""
         self.members = {
             n: replace(m, T_cw=T_cw[self.first[n] :][: len(m.T_cw)])
             for n, m in self.members.items()
         }
 
     def follow(self, poses: "_Poses", is_last: bool = False) -> list[PoseSums | None]:
-        """Bring the depths after a step; what the parts say of the next."""
+        """Update the depths after a step; return the parts' equations for the next one."""
         jobs = []
         for n, own in self.members.items():
             others = tuple(self.members[m] for m in self.linked[n])
@@ -198,7 +198,7 @@ class _Adjustment:
         return torch.cat([member.T_cw for member in self.members.values()])
 
     def _new(self, name: str) -> Path:
-        """A file that no job has written: one that is done again finds what the first found."""
+        """A new file for a job's output: a repeated job finds the same input as the first time."""
         self.written += 1
         return self.folder / f"{name}-{self.written}.safetensors"
 
@@ -212,7 +212,7 @@ class _AllPoses:
         self.system = SparseCameraSystem(*adjustment.ends_of_edges(), free)
 
     def linearise(self, state: _Poses) -> SparseCameraSystem:
-        """The depths of all parts follow the last step; what these then say of the poses."""
+        """Update the depths of all parts after the last step; sum up their equations."""
         self.system.clear()
         for sums in self.adjustment.follow(state):
             if sums is not None:
@@ -222,7 +222,7 @@ class _AllPoses:
     def step(
         self, state: _Poses, linear: SparseCameraSystem, damping: float
     ) -> Step[_Poses] | None:
-        """One step of the least-squares loop; the parts' keyframes move at once."""
+        """Take one step of the least-squares loop; the parts' keyframes get the new poses."""
         found = linear.solve(damping, FLOOR)
         if found is None:
             return None
@@ -234,9 +234,9 @@ class _AllPoses:
 
 @on_one_torch_thread
 def follow(job: StepJob) -> PoseSums | None:
-    """Bring the depths of a part after a step and write them; what it says of the next step.
+    """Update the depths of a part after a step and write them; return its next equations.
 
-    By the numbers of the whole; nothing where there is no next.
+    These use the indices among all keyframes; none after the last step.
     """
     grid, options = SampleGrid(job.camera), GLOBAL_OPTIONS
     graph, nodes = _known_graph(job, grid)
@@ -271,7 +271,7 @@ def follow(job: StepJob) -> PoseSums | None:
 
 
 def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]]:
-    """The edges that leave a part's keyframes, which come first; the node of each keyframe."""
+    """Graph of the edges that leave a part's keyframes, which come first; all keyframes' nodes."""
     edges: dict[Directed, PackedEdge] = {}
     for path in job.matches:
         edges |= read_record(Matches, path).edges()

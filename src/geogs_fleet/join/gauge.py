@@ -1,4 +1,4 @@
-"""A frame and unit for every part: which links of two parts agree, and what hangs together."""
+"""Frame and unit of every part: agreement of the links of two parts, and connected parts."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from geogs_fleet.join.part import PartViews
 
 @dataclass(frozen=True)
 class Gauge:
-    """The parts that make one world."""
+    """The parts of one world."""
 
     world: dict[int, Float[Tensor, "4 4"]]
-    """Sim(3) from the joint world to that of each part in it, by the part's number."""
+    """Sim(3) from the joint world to that of each part, by the part's number."""
     links: tuple[Link, ...]
-    """Between parts of the world that agree with it."""
+    """Links between parts of the world that agree with it."""
 
     @property
     def parts(self) -> list[int]:
@@ -30,7 +30,7 @@ class Gauge:
 
     @property
     def linked(self) -> dict[int, list[int]]:
-        """The parts that each part is linked to, ascending."""
+        """Parts to which each part is linked, ascending."""
         linked: dict[int, set[int]] = {n: set() for n in self.parts}
         for link in self.links:
             linked[link.first[0]].add(link.second[0])
@@ -50,8 +50,8 @@ class _Tie:
 def common_gauge(parts: Sequence[PartViews], links: Sequence[Link]) -> Gauge:
     """The largest world that agreeing links make of the parts; its first part keeps its own frame.
 
-    Two parts are tied where enough of their links agree, as segments of a run are. Ties with most
-    links are taken first (a maximum spanning tree); a tie that contradicts those stays out.
+    Two parts are tied if enough of their links agree, like segments of a run. Ties with most links
+    are taken first (a maximum spanning tree); ties that contradict those are left out.
     """
     ties = _ties(parts, links)
     group = list(range(len(parts)))
@@ -96,7 +96,7 @@ def _ties(parts: Sequence[PartViews], links: Sequence[Link]) -> dict[tuple[int, 
 
 
 def claim(parts: Sequence[PartViews], link: Link) -> Float[Tensor, "4 4"]:
-    """Sim(3) from the world of the first part to that of the second as a link has it."""
+    """Sim(3) from the world of the first part to that of the second, according to a link."""
     first, second = (torch.from_numpy(parts[p].T_cw[n]) for p, n in (link.first, link.second))
     return se3_inverse(second) @ link.S_ji @ first
 
@@ -104,7 +104,7 @@ def claim(parts: Sequence[PartViews], link: Link) -> Float[Tensor, "4 4"]:
 def _agrees(
     parts: Sequence[PartViews], link: Link, S: Float[Tensor, "4 4"], tolerance: float
 ) -> bool:
-    """Whether a link lands where a Sim(3) between the worlds would."""
+    """Whether a link agrees with a Sim(3) between the worlds."""
     part, n = link.second
     T = torch.from_numpy(parts[part].T_cw[n])
     depth = torch.tensor(parts[part].median_depth[n])

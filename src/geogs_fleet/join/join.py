@@ -1,4 +1,4 @@
-"""Parts to one place, from the first look at them to the files."""
+"""Joins parts to one result, from their description to the files."""
 
 import json
 import shutil
@@ -39,9 +39,9 @@ from geogs_fleet.join.stored_views import equal_runs, render_views
 from geogs_fleet.workers import Workers
 
 _PAIRS = 24
-"""Pairs of keyframes that are verified in one go."""
+"""Pairs of keyframes verified in one job."""
 _RUNS_PER_WORKER = 4
-"""Runs of keyframes for each worker that are rendered in one go."""
+"""Jobs for each worker to render runs of keyframes."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Joint:
 
     output: Path
     unjoined: tuple[str, ...]
-    """Parts in which nothing of the others was recognised: their own results are all there is."""
+    """Parts that could not be joined with the others: they only have their own results."""
     sentence: str
-    """For the terminal."""
+    """Sentence for the terminal."""
 
 
 class _Join:
@@ -78,7 +78,7 @@ class _Join:
         return [link for some in self.workers.map("verifying", links_of, jobs) for link in some]
 
     def disks(self, gauge: Gauge, placements: dict[int, Placement]) -> MapSnapshot:
-        """The maps of all parts, moved and merged; the earlier part's disks stay."""
+        """Move and merge the maps of all parts; the earlier part's disks stay."""
         numbers = gauge.parts
         files = {n: self.work / f"disks-{n:04d}.safetensors" for n in numbers}
         moves = [
@@ -91,7 +91,7 @@ class _Join:
         return joined_disks([kept(load_map_file(files[n], "cpu").disks, k) for n, k in pairs])
 
     def surface(self, count: int, disks: MapSnapshot) -> Mesh | None:
-        """The mesh of the result that has been written, and colours of its disks."""
+        """Write the mesh of the result, and the coloured splats of its disks."""
         folder = self.work / "renders"
         folder.mkdir(parents=True, exist_ok=True)
         runs = equal_runs(count, _RUNS_PER_WORKER * self.workers.at_once)
@@ -123,23 +123,23 @@ def join_parts(
     adjust: bool = True,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> Joint:
-    """One result of the parts that hang together, in a folder, as a run would have written it.
+    """Write one result of the connected parts into a folder, as a run would write it.
 
-    The first part that is in it keeps its frame and unit. Parts in which nothing of the others was
-    recognised stay what they are.
+    The first of these parts keeps its frame and unit. Parts that share nothing with the others stay
+    unchanged.
 
     Args:
         parts: at least two.
-        output: the folder; everybody who works has to see it.
-        config: how places are recognised, keyframes adjusted and the surface made.
-        workers: who does the jobs.
-        device: where they render and fuse.
+        output: the folder; all workers have to see it.
+        config: settings of place recognition, adjustment and surface.
+        workers: they do the jobs.
+        device: for rendering and fusion.
         adjust: whether keyframes are adjusted with the matches of overlapping parts; else links
-            and parts alone say where they are.
-        say: is given a line on how far the work is.
+            and parts alone determine their poses.
+        say: receives a line on the progress of the work.
 
     Raises:
-        InputError: a part cannot be used, or no two of them show one place.
+        InputError: a part cannot be used, or no two of them overlap.
         OutputError: a file cannot be written.
     """
     begin = time.perf_counter()
@@ -154,7 +154,7 @@ def join_parts(
 def _placed_parts(
     join: _Join, adjust: bool, say: Callable[[str], None]
 ) -> tuple[Gauge, dict[int, JoinedPart]]:
-    """The parts that hang together with their places in the joint world, by their numbers."""
+    """The connected parts with their poses in the joint world, by their numbers."""
     parts, config = join.parts, join.config
     with join.stopwatch("describing"):
         files = zip(parts, join.files, strict=True)

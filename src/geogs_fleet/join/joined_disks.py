@@ -1,4 +1,4 @@
-"""The disks of a part, moved to the joint world; and those that another part has already."""
+"""Disks of a part, moved to the joint world and without those that another part already has."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
@@ -23,18 +23,18 @@ from geogs_fleet.join.records import read_record
 _COLUMNS = [field.name for field in fields(MapSnapshot)]
 _NEAREST = 8
 _WITHIN = 2.0
-"""Standard deviations of a disk within which it stands for another in its plane."""
+"""Standard deviations of a disk, in its plane, within which it covers another."""
 _AWAY = 1.0
-"""Mean of these within which another is still its surface, along its normal."""
+"""Multiple of their mean within which it does so along its normal."""
 _ALIKE = 0.8
-"""Cosine between the normals of two disks of one surface, at least."""
+"""Least cosine between the normals of two disks of one surface."""
 
 
 @on_one_torch_thread
 def move_disks(
     part: Part, views_file: Path, placement: Placement, after: Path, device: str = "cpu"
 ) -> None:
-    """Move every disk of a part with the keyframes that see it in place, into the file ``after``.
+    """Move every disk of a part with the keyframes that see it; write the file ``after``.
 
     This is the update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
     """
@@ -56,7 +56,7 @@ def move_disks(
 
 
 def overall(views: PartViews, similarities: Float[Tensor, "n 4 4"]) -> Float[Tensor, "4 4"]:
-    """The one Sim(3) nearest to what the keyframes of a part say, of themselves and their view."""
+    """The Sim(3) nearest to those of a part's keyframes, at their centres and in their views."""
     T_wc = se3_inverse(torch.from_numpy(views.T_cw))
     depth = torch.from_numpy(views.median_depth)
     corners = depth.new_tensor([[0, 0, 0], [-0.5, -0.4, 1], [0.5, -0.4, 1], [0, 0.6, 1]])
@@ -70,7 +70,7 @@ def overall(views: PartViews, similarities: Float[Tensor, "n 4 4"]) -> Float[Ten
 
 
 def transformed(disks: MapSnapshot, S: Float[Tensor, "n 4 4"]) -> MapSnapshot:
-    """Each disk by its own similarity."""
+    """Transform each disk by its own similarity."""
     if not len(disks):
         return disks
     none = torch.zeros(len(disks), dtype=torch.long, device=disks.position.device)
@@ -82,7 +82,7 @@ def transformed(disks: MapSnapshot, S: Float[Tensor, "n 4 4"]) -> MapSnapshot:
 
 @on_one_torch_thread
 def merge_disks(file: Path, before: Sequence[Path]) -> Bool[Tensor, "n"]:
-    """Which disks of a part no disk of the parts ``before`` stands for; all by their files."""
+    """Mask of the disks of a part that no disk of the parts ``before`` covers, by their files."""
     own = load_map_file(file, "cpu").disks
     keep = torch.ones(len(own), dtype=torch.bool)
     for path in before:
@@ -91,7 +91,7 @@ def merge_disks(file: Path, before: Sequence[Path]) -> Bool[Tensor, "n"]:
 
 
 def is_covered(disks: MapSnapshot, others: MapSnapshot) -> Bool[Tensor, "n"]:
-    """Which disks lie on one of others that faces the same way, within its extent."""
+    """Mask of the disks that lie within the extent of one of ``others`` with a similar normal."""
     covered = torch.zeros(len(disks), dtype=torch.bool)
     if not len(disks) or not len(others):
         return covered
@@ -121,5 +121,5 @@ def joined_disks(disks: Sequence[MapSnapshot]) -> MapSnapshot:
 
 
 def kept(disks: MapSnapshot, keep: Bool[Tensor, "n"]) -> MapSnapshot:
-    """The disks that are marked."""
+    """The marked disks."""
     return MapSnapshot(*(getattr(disks, c)[keep] for c in _COLUMNS))

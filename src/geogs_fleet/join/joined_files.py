@@ -1,4 +1,4 @@
-"""The files of a joint result: those of a run."""
+"""Files of a joint result, the same as those of a run."""
 
 import hashlib
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from geogs_fleet.join.part_graph import Placement
 
 @dataclass(frozen=True)
 class JoinedPart:
-    """A part that has its place in the joint world."""
+    """A part with its poses in the joint world."""
 
     result: SavedResult
     views: PartViews
@@ -44,7 +44,7 @@ class JoinedPart:
 
 
 def write_poses(output: Path, parts: Sequence[JoinedPart]) -> Trajectory:
-    """``trajectory.tum``, ``keyframes.tum`` and the table of what is known of each frame.
+    """Write ``trajectory.tum``, ``keyframes.tum`` and the table of the frames' uncertainty.
 
     Returns the trajectory. Raises OutputError if a file cannot be written.
     """
@@ -65,7 +65,7 @@ def write_poses(output: Path, parts: Sequence[JoinedPart]) -> Trajectory:
 def write_map(
     output: Path, parts: Sequence[JoinedPart], disks: MapSnapshot, camera: Camera, config: Config
 ) -> None:
-    """The disks with the keyframes of all parts, their images, the camera and the settings.
+    """Write the disks, the keyframes of all parts, their images, the camera and the settings.
 
     Raises:
         InputError: an image of a part cannot be read.
@@ -78,7 +78,7 @@ def write_map(
         for n, id in enumerate(part.result.views.keyframe_id.tolist()):
             target = image_path(output, count)
             if part.result.camera == camera:
-                part.result.image(n)  # a picture, wherever a link leads
+                part.result.image(n)  # fails unless it is an image, also behind a link
                 with atomic_file(target) as stream:
                     stream.write(read_bytes(image_path(part.result.folder, id)))
             else:
@@ -112,7 +112,7 @@ def write_map(
 
 
 def fingerprint(parts: Sequence[SavedResult]) -> str:
-    """Fingerprint of the parts: changes with theirs."""
+    """Fingerprint of a joint result, from those of its parts."""
     words = [str(part.summary.get("fingerprint", part.folder)) for part in parts]
     return hashlib.sha256("\n".join(words).encode()).hexdigest()[:16]
 
@@ -122,6 +122,6 @@ def _times(parts: Sequence[JoinedPart]) -> Float64[np.ndarray, "n"]:
 
 
 def _uncertainty_rows(part: JoinedPart) -> list[str]:
-    """The rows of a part's table in the joint time and unit; deviations stay those in the part."""
+    """Rows of a part's table in the joint time and unit; standard deviations are the part's."""
     path = part.result.folder / "trajectory_uncertainty.csv"
     return moved_rows(path, 1 / float(part.placement.scale.median()), part.span.shift)

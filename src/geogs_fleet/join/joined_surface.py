@@ -1,4 +1,4 @@
-"""The surface of a joint map: boxes of space side by side, stitched here."""
+"""The surface of a joint map: boxes of space, meshed concurrently and stitched here."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ from geogs_fleet.join.stored_views import StoredView, equal_runs, loaded
 from geogs_fleet.workers import Workers
 
 _BOXES_PER_WORKER = 3
-"""Boxes for each worker, at least, so that none waits long for the last."""
+"""Least number of boxes for each worker, so that none waits long for the last."""
 _NO_FACES = np.zeros((0, 3), np.int32)
 
 
 def occupied(views: Sequence[StoredView], plan: VolumePlan) -> Int[np.ndarray, "k 3"]:
-    """Coordinates of the blocks that have surface."""
+    """Coordinates of the blocks that contain surface."""
     found = [blocks_of(view, plan) for view in loaded(views)]
     return torch.unique(torch.cat(found), dim=0).cpu().numpy()
 
@@ -40,7 +40,7 @@ def occupied(views: Sequence[StoredView], plan: VolumePlan) -> Int[np.ndarray, "
 def box_surface(
     views: Sequence[StoredView], plan: VolumePlan, box: BlockBox, min_weight: float, device: str
 ) -> MeshBlock:
-    """The surface of a box of space, from the views that may change it, in their order."""
+    """Mesh of a box of space, from the views that may change it, in their order."""
     return mesh_block(loaded(views), plan, box, min_weight, device)
 
 
@@ -50,8 +50,8 @@ def colours_of(
     normals: Float[np.ndarray, "n 3"],
     tolerance: float,
 ) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of points: what the images show there."""
-    mesh = Mesh(points.copy(), _NO_FACES, normals.copy())  # what Ray brings is read-only
+    """Colours of points in the images."""
+    mesh = Mesh(points.copy(), _NO_FACES, normals.copy())  # Ray's arrays are read-only
     colours = colour_mesh(mesh, loaded(views, True), tolerance).colours
     assert colours is not None
     return colours
@@ -59,7 +59,7 @@ def colours_of(
 
 @dataclass(frozen=True)
 class SpacePlan:
-    """How the space of all views is divided."""
+    """Division of the space of all views into boxes."""
 
     volume: VolumePlan
     boxes: tuple[BlockBox, ...]
@@ -68,7 +68,7 @@ class SpacePlan:
 
 
 def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers) -> SpacePlan:
-    """Voxels for all views, and boxes of which each fits into the memory limit.
+    """Choose voxels for all views, and boxes that each fit into the memory limit.
 
     Raises:
         InputError: no view has a valid depth.
@@ -92,7 +92,7 @@ def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers
 def joint_mesh(space: SpacePlan, config: MeshConfig, workers: Workers, device: str) -> Mesh:
     """Fuse, extract, colour, decimate and smooth.
 
-    But for the colours of points that no image shows, the mesh is that of one volume.
+    Except for the colours of points that no image shows, the mesh is that of one volume.
 
     Raises:
         InputError: there is no surface.

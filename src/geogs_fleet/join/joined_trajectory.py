@@ -13,7 +13,7 @@ from geogs_fleet.join.part_graph import Placement
 
 
 def spans_of(names: list[str], times: list[Float64[np.ndarray, "n"]]) -> list[RecordingSpan]:
-    """The parts one after the other, as ``geogs run`` puts several videos."""
+    """Spans of the parts one after the other, like those of several videos in ``geogs run``."""
     spans: list[RecordingSpan] = []
     frames, end = 0, 0.0
     for name, own in zip(names, times, strict=True):
@@ -24,7 +24,7 @@ def spans_of(names: list[str], times: list[Float64[np.ndarray, "n"]]) -> list[Re
 
 
 def moved_trajectory(trajectory: Trajectory, views: PartViews, placement: Placement) -> Trajectory:
-    """Poses of a part's frames in the joint world; between keyframes by both, in time."""
+    """Poses of a part's frames in the joint world, interpolated in time between keyframes."""
     S = placement.similarities(views.T_cw)
     times = views.timestamp
     at = trajectory.timestamps.clip(times[0], times[-1])

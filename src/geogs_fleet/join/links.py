@@ -1,4 +1,4 @@
-"""Keyframes of two parts that show one place, found by appearance and verified: loops of a run."""
+"""Links: keyframes of two parts with a common view, found by appearance and verified like loops."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -27,29 +27,29 @@ from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
 from geogs_fleet.join.records import read_record
 
 Candidates = dict[tuple[int, int], list[tuple[int, int]]]
-"""Places of keyframes in two parts, by the numbers of these, the earlier first."""
+"""Indices of keyframes in two parts, by the numbers of these, the earlier first."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """A pair of keyframes of two parts that show one place."""
+    """A pair of keyframes of two parts with a common view."""
 
     first: Node
     second: Node
     S_ji: Float[Tensor, "4 4"]
-    """Sim(3) that takes points of the first camera, in its part's lengths, to the second in its."""
+    """Sim(3) from the first camera, in its part's unit, to the second, in its part's unit."""
     matched: float
     """Fraction of the cells whose flow agrees."""
     relative: RelativePoses
-    """The poses with information, between 0 (the first) and 1, in both directions."""
+    """Relative poses with information, between 0 (the first) and 1, in both directions."""
 
 
 def candidates(parts: Iterable[PartViews], config: LoopConfig) -> Candidates:
     """Pairs of keyframes of different parts that look alike, most alike first.
 
-    Each keyframe is compared with those of all parts before its own. Of a pair of parts, a pair of
+    Each keyframe is compared with those of all parts before its own. Within two parts, a pair of
     keyframes rules out others whose ends together lie within ``SUPPRESSION`` keyframes of its own.
-    Parts are looked at one at a time; what stays in memory is the index.
+    Parts are read one at a time; only the index stays in memory.
     """
     index = AppearanceIndex()
     names: list[tuple[int, int]] = []
@@ -75,9 +75,9 @@ def links_of(
     camera: Camera,
     config: Config,
 ) -> list[Link]:
-    """Pairs of keyframes of two parts that are links: by features with depth, then by dense flow.
+    """Verify pairs of keyframes of two parts, by features with depth, then by dense flow.
 
-    ``numbers`` are the parts' own, ``files`` those of their views; ``pairs`` are places in them.
+    ``numbers`` are the parts' own, ``files`` those of their views; ``pairs`` are indices in them.
     """
     grid = SampleGrid(camera)
     verifier = TwoViewVerifier(camera)
@@ -123,10 +123,10 @@ def loaded_keyframes(
     places: Iterable[int],
     T_cw: Float[Tensor, "n 4 4"] | None = None,
 ) -> dict[int, Keyframe]:
-    """Keyframes of a part put into a segment; by their place in the part.
+    """Add keyframes of a part to a segment; return them by their index in the part.
 
-    With the poses ``T_cw`` that all keyframes have in another world, if they are given; depths are
-    in the lengths of the part.
+    Their poses are ``T_cw``, those of all keyframes in another world, if given; depths are in the
+    unit of the part.
     """
     grid = segment.grid
     loaded = {}
@@ -149,7 +149,7 @@ def _seen(grid: SampleGrid, views: PartViews, n: int) -> FeatureView:
 
 
 def _between(relative: RelativePoses, first: int) -> RelativePoses:
-    """Between 0 and 1 in place of two ids."""
+    """Replace two ids by 0 and 1."""
     source, target = ((end != first).long() for end in (relative.source, relative.target))
     return replace(relative, source=source, target=target)
 

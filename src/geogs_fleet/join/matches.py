@@ -1,4 +1,4 @@
-"""Matches of a part's keyframes, among each other and with linked parts, kept in files."""
+"""Matches of a part's keyframes, with each other and with linked parts, kept in files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ Directed = tuple[Node, Node]
 
 @dataclass(frozen=True)
 class Depths:
-    """The depths of a part's keyframes on the grid, in lengths of the joint world."""
+    """The depths of a part's keyframes on the grid, in the unit of the joint world."""
 
     inverse: Float32[Tensor, "n p"]
     information: Float32[Tensor, "n p"]
@@ -47,14 +47,14 @@ class Depths:
     """Cells that show something dynamic."""
 
     def give(self, keyframe: Keyframe, place: int) -> None:
-        """Let a keyframe, the one at a place in the part, have its depths."""
+        """Give a keyframe its depths, by its index in the part."""
         keyframe.inverse_depth, keyframe.information = self.inverse[place], self.information[place]
         keyframe.moving = self.moving[place]
 
 
 @dataclass(frozen=True)
 class Member:
-    """A part at some point of the adjustment."""
+    """A part at one point of the adjustment."""
 
     number: int
     part: Part
@@ -64,7 +64,7 @@ class Member:
     scale: Float[Tensor, "n"]
     """Divisor of the part's lengths around each keyframe."""
     adjusted: Path | None = None
-    """File of its depths; those that its map shows where there is none."""
+    """File of its depths; without one, those rendered from its map are used."""
 
     @property
     def nodes(self) -> list[Node]:
@@ -72,7 +72,7 @@ class Member:
         return [(self.number, place) for place in range(len(self.T_cw))]
 
     def depths(self) -> Depths:
-        """The depths as they are now."""
+        """Current depths."""
         if self.adjusted is not None:
             return read_record(Depths, self.adjusted)
         views, scale = read_record(PartViews, self.views), self.scale.float()[:, None]
@@ -82,26 +82,26 @@ class Member:
 
 @dataclass(frozen=True)
 class Matches:
-    """Directed edges of the frame graph, as :class:`PackedEdge` has them."""
+    """Directed edges of the frame graph, as arrays of :class:`PackedEdge`."""
 
     ends: Int[np.ndarray, "e 4"]
-    """Source and target: part and place of each."""
+    """Source and target: part and index of each."""
     position: Int16[np.ndarray, "e p 2"]
     half_weight: Float16[np.ndarray, "e p 2"]
     poses: Float[np.ndarray, "e 2 4 4"]
-    """Poses of source and target when they were matched."""
+    """Poses of source and target at the time of matching."""
     inverse_depth: Float32[np.ndarray, "e p"]
     """Inverse depth of the source at that time."""
     damping: Float32[np.ndarray, "d p"]
-    """Damping of the source's depth; of no edge where the flow gives none."""
+    """Damping of the source's depth; empty if the flow gives none."""
     shift: Int16[np.ndarray, "s p 2"]
-    """To be added to the positions, for the rows of a rolling shutter; of no edge without one."""
+    """Correction of the positions for the rows of a rolling shutter; empty without one."""
 
     @staticmethod
     def of(
         edges: Mapping[Directed, PackedEdge], shift: Mapping[Directed, Tensor], cells: int
     ) -> "Matches":
-        """Edges in order, with the shift of each where there are any."""
+        """Pack edges in order, with the shift of each if there are any."""
         flows = [edges[pair] for pair in sorted(edges)]
         if not flows:
             empty, pixels = np.zeros((0, cells), np.float32), np.zeros((0, cells, 2))
@@ -122,7 +122,7 @@ class Matches:
         )
 
     def edges(self, as_found: bool = False) -> dict[Directed, PackedEdge]:
-        """Edges of a graph; without the shifts ``as_found``."""
+        """Edges of a graph; ``as_found`` leaves out the shifts."""
         found = {}
         for n, (a, i, b, j) in enumerate(self.ends.tolist()):
             position, weight, poses, depth = (
@@ -143,7 +143,7 @@ class Matched:
     ends: Int[np.ndarray, "e 4"]
     """All directed edges."""
     fresh: int
-    """Pairs that were matched now."""
+    """Number of newly matched pairs."""
 
 
 @on_one_torch_thread
@@ -155,14 +155,14 @@ def match(
     before: Sequence[Path],
     after: Sequence[Path],
 ) -> Matched:
-    """Match pairs that are near in what they show, in both directions, and write the files.
+    """Match pairs with near views in both directions, and write the files.
 
     Args:
         own: a part whose keyframes are matched with each other and with those of others.
-        others: linked to it, of higher numbers: with the lower ones it is theirs to do.
-        camera: by which all keyframes are seen.
-        config: how they are matched.
-        before: files of what was matched before; only what has moved since is matched again.
+        others: linked parts of higher numbers; those of lower numbers match themselves with it.
+        camera: of all keyframes.
+        config: settings of the matching.
+        before: files of earlier matches; only pairs that have moved since are matched again.
         after: files to write: edges that leave its own keyframes, then those of each other part.
     """
     grid, members = SampleGrid(camera), (own, *others)
@@ -215,7 +215,7 @@ def _row_errors(
 ) -> RowErrors | None:
     """Errors of the rectified rows of the keyframes, by the trajectories of their parts.
 
-    None where nothing was rectified. Rows of another camera than the grid's stay as they are.
+    None if nothing was rectified. Rows of another camera than the grid's stay unchanged.
     """
     found: RowErrors | None = None
     others = 0
@@ -243,7 +243,7 @@ def _row_errors(
 
 
 def _pairs(graph: FrameGraph, own: int) -> list[Pair]:
-    """Pairs within a part, and of it with others, whose keyframes come behind its own."""
+    """Pairs within a part, and with others, whose keyframes come after its own."""
     segment, camera = graph.keyframes, graph.keyframes.grid.camera
     first, others = segment.ids[:own], segment.ids[own:]
     limit, count = MAX_DISTANCE * max(camera.width, camera.height), PAIRS * own
@@ -254,7 +254,7 @@ def _pairs(graph: FrameGraph, own: int) -> list[Pair]:
 
 
 def _near(own: Member, others: Sequence[Member]) -> set[Node]:
-    """Keyframes of others that are no further from one of its own than what they show."""
+    """Keyframes of others whose distance to one of its own is less than their median depth."""
     around, near = _centres(own), set[Node]()
     for other in others:
         depth = read_record(PartViews, other.views).median_depth / other.scale.numpy()

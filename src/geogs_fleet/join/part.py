@@ -1,4 +1,4 @@
-"""A part of the place: a finished result, and its keyframes as one common camera sees them."""
+"""A part of a join: a finished result, and its keyframes resampled to one common camera."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,19 +19,19 @@ from geogs.world.loops import ImageFeatures
 from geogs_fleet.join.records import write_record
 
 DEVIATION = 0.01
-"""Relative deviation of a depth that a map was trained to show."""
+"""Relative standard deviation of a depth that a map was trained on."""
 Node = tuple[int, int]
-"""A keyframe: the number of its part, and its place among the part's keyframes."""
+"""A keyframe: the number of its part, and its index among the part's keyframes."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A result that is to be joined with others."""
+    """A result to be joined with others."""
 
     name: str
-    """No other part has it."""
+    """Name, unique among the parts."""
     folder: Path
-    """The result, as ``geogs run`` writes it."""
+    """Result of ``geogs run``."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class PartViews:
     timestamp: Float64[np.ndarray, "n"]
     """Seconds, in the part's own time."""
     inverse_depth: Float32[np.ndarray, "n p"]
-    """On the grid; rendered from the part's map, filled where that shows nothing."""
+    """On the grid; rendered from the part's map, filled where the map is empty."""
     information: Float32[np.ndarray, "n p"]
-    """Inverse variances of these; 0 where the map shows nothing."""
+    """Inverse variances of these; 0 where the map is empty."""
     features: tuple[ImageFeatures, ...]
 
     @property
@@ -54,7 +54,7 @@ class PartViews:
         return 1 / np.median(self.inverse_depth, axis=1).astype(np.float64)
 
     def outline(self) -> "PartViews":
-        """One depth a keyframe and no features: so little that all parts fit into one memory."""
+        """Reduce to one depth a keyframe and no features: all parts then fit into memory."""
         middle = np.median(self.inverse_depth, axis=1, keepdims=True)
         return PartViews(self.T_cw, self.timestamp, middle, 0 * middle, ())
 
@@ -63,7 +63,7 @@ class PartViews:
 def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int:
     """Find the features of a part's keyframes, render their depths, and write both to a file.
 
-    Everything is seen by ``camera``, which is common to all parts. Returns the number of keyframes.
+    Both are in the pixels of ``camera``, common to all parts. Returns the number of keyframes.
     Raises InputError if the result has no images, or is damaged.
     """
     result = opened(part, device)
@@ -83,7 +83,7 @@ def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int
 
 
 def opened(part: Part, device: str = "cpu") -> SavedResult:
-    """The result of a part. Raises InputError if it cannot be joined with others."""
+    """Load the result of a part. Raises InputError if it cannot be joined with others."""
     result = load_result(part.folder, device)
     if not len(result.views.keyframe_id):
         raise InputError(f"{part.folder} has no keyframes; nothing can be joined to it.")
@@ -96,7 +96,7 @@ def opened(part: Part, device: str = "cpu") -> SavedResult:
 
 
 def image_of(result: SavedResult, number: int, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
-    """The image of a keyframe, by its place, as another camera at its place would have taken it."""
+    """The image of a keyframe, by its index, resampled to another camera of the same pose."""
     path = image_path(result.folder, int(result.views.keyframe_id[number]))
     return resampled(read_image(path), result.camera, camera)
 
@@ -104,7 +104,7 @@ def image_of(result: SavedResult, number: int, camera: Camera) -> UInt8[np.ndarr
 def resampled(
     image: UInt8[np.ndarray, "h w 3"], own: Camera, other: Camera
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """An image of one pinhole camera as another with the same pose sees it; black outside."""
+    """Resample an image of a pinhole camera to another of the same pose; black outside."""
     if own == other:
         return image
     sx, sy = other.fx / own.fx, other.fy / own.fy
@@ -116,7 +116,7 @@ def resampled(
 def _on_grid(
     result: SavedResult, T_cw: torch.Tensor, grid: SampleGrid
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse depth and information of the cells, from the depth that the map shows."""
+    """Inverse depth and information of the cells, from the depth rendered from the map."""
     from geogs.bundle.device_choice import grid_fields
 
     long_edge = max(result.depth_camera.width, result.depth_camera.height)

@@ -1,4 +1,4 @@
-"""All keyframes of one world in one Sim(3) pose graph: each part is stiff, links pull."""
+"""All keyframes of one world in one Sim(3) pose graph: stiff within each part, joined by links."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.part import PartViews
 
 STEP = 1e-3
-"""Deviation between two keyframes near each other after a part's own adjustment: radians, parts of
-the depth, and of the scale."""
+"""Standard deviation between neighbouring keyframes after a part's own adjustment: radians,
+fraction of the depth, and of the scale."""
 STEPS = (1, 2, 4)
-"""Keyframes so far apart in time are tied to each other."""
+"""Differences in index of keyframes that are tied to each other."""
 NEAREST = 4
-"""And each to so many that are nearest to it in place and look about the same way."""
+"""Number of keyframes, nearest in position and viewing direction, to which each is tied, too."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the keyframes of a part are in the joint world."""
+    """Poses of a part's keyframes in the joint world."""
 
     T_cw: Float[Tensor, "n 4 4"]
     """Joint world to camera, float64."""
     scale: Float[Tensor, "n"]
-    """Divisor of the lengths around each keyframe, from the part's to the joint."""
+    """Divisor of the lengths around each keyframe, from the part's unit to the joint one."""
 
     def similarities(self, T_before: Float[np.ndarray, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
-        """From the part's world to the joint one, as each keyframe has it."""
+        """Sim(3) from the part's world to the joint one, at each keyframe."""
         T = torch.from_numpy(T_before).clone()
         T[:, :3] /= self.scale[:, None, None]
         T[:, 3, 3] = 1
@@ -42,9 +42,9 @@ class Placement:
 
 
 def placed(parts: Sequence[PartViews], gauge: Gauge) -> dict[int, Placement]:
-    """The keyframes of every part of a world, by the part's number, after the adjustment.
+    """Place the keyframes of every part of a world, by the part's number, by the pose graph.
 
-    The first keyframe of the first part stays where it is.
+    The first keyframe of the first part is fixed.
     """
     numbers = gauge.parts
     counts = [len(parts[n].T_cw) for n in numbers]
@@ -85,7 +85,7 @@ def _stiff(part: PartViews, offset: int) -> RelativePoses:
 
 
 def _pairs(part: PartViews) -> Int[Tensor, "e 2"]:
-    """Keyframes near each other in time, and in place."""
+    """Pairs of keyframes near each other in time, or in pose."""
     n = len(part.T_cw)
     pairs = {(a, a + step) for step in STEPS for a in range(n - step)}
     rotation = part.T_cw[:, :3, :3]

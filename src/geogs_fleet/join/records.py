@@ -1,4 +1,4 @@
-"""Records of arrays in files that jobs of a join leave for each other, as in checkpoints."""
+"""Records of arrays in files for the exchange between jobs of a join, as in checkpoints."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ def write_record(path: Path, record: object) -> None:
 
 
 def read_record(kind: type[R], path: Path) -> R:
-    """The record of this kind that ``write_record`` wrote."""
+    """Read a record of this kind that ``write_record`` wrote."""
     with safe_open(require_file(path), "pt") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         record: R = unpack(kind, json.loads(file.metadata()["values"]), arrays, {})

@@ -1,4 +1,4 @@
-"""The joint map seen from every keyframe, in files, so that each is rendered once."""
+"""Renders of the joint map from every keyframe, in files, so that each is rendered once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class StoredView:
     T_cw: Float64[np.ndarray, "4 4"]
 
     def load(self, with_image: bool = False) -> DepthMapView:
-        """The depth map in the file; with the image only where it is wanted."""
+        """Load the depth map, and the image if requested."""
         with open_file(self.file) as stored, np.load(stored, allow_pickle=False) as file:
             depth, weight = torch.from_numpy(file["depth"]), torch.from_numpy(file["weight"])
         image = read_image(self.image) if with_image else None
@@ -36,12 +36,12 @@ class StoredView:
 
     @property
     def pose(self) -> Float[Tensor, "4 4"]:
-        """World to camera; a copy, as what Ray brings cannot be written."""
+        """World to camera; a copy, as Ray's arrays are read-only."""
         return torch.tensor(self.T_cw)
 
 
 def loaded(views: Sequence[StoredView], with_images: bool = False) -> Sequence[DepthMapView]:
-    """Each when it is asked for."""
+    """Sequence of views, each loaded on demand."""
     return OnDemand(views, lambda view: view.load(with_images))
 
 
@@ -54,7 +54,7 @@ def render_views(
         T_cw = result.views.T_cw[n]
         maps = result.renderer.surface(torch.from_numpy(T_cw))
         file = folder / f"{n:06d}.npz"
-        # 0, a half and 1 are the same in half precision.
+        # The weights 0, a half and 1 are exact in half precision.
         np.savez(file, depth=maps.depth.cpu().numpy(), weight=maps.weight.cpu().half().numpy())
         image = image_path(written, int(result.views.keyframe_id[n]))
         made.append(StoredView(file, image, result.depth_camera, T_cw))
@@ -62,6 +62,6 @@ def render_views(
 
 
 def equal_runs(count: int, parts: int) -> list[tuple[int, ...]]:
-    """The numbers below ``count`` in so many runs of about equal length, none of them empty."""
+    """Split the numbers below ``count`` into ``parts`` runs of about equal length, none empty."""
     ends = np.linspace(0, count, min(max(parts, 1), max(count, 1)) + 1).round().astype(int)
     return [tuple(range(a, b)) for a, b in pairwise(ends) if b > a]

@@ -11,7 +11,7 @@ from geogs_synth.draw import rotated
 MIN_Z = 0.01
 """Least depth in metres of points that have a projection."""
 ROUNDS = 8
-"""Projections until the row that sees a point is known; each leaves a tenth of the error."""
+"""Projections that find the row that sees a point; each leaves a tenth of the error."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class CameraBatch:
     """Pixels."""
     sweep: Float[Tensor, "b v 6"] | None = None
     """Motion of a camera from its first row to its last: rotation vector and translation (metres)
-    in the frame of its middle row, which ``T_cw`` is of; None where all rows are read at once."""
+    in the frame of its middle row (that of ``T_cw``); None where all rows are read at once."""
 
     @property
     def R_wc(self) -> Float[Tensor, "b v 3 3"]:
@@ -41,8 +41,8 @@ class CameraBatch:
         return -(self.R_wc @ self.T_cw[..., :3, 3:])[..., 0]
 
     def packed(self) -> Float[Tensor, "b v 24"]:
-        """What the kernels read: camera to world by rows, the intrinsics, the motion while rows are
-        read, and the fraction of that from row to row."""
+        """Kernel input: camera to world by rows, intrinsics, the motion during the readout, and
+        the fraction of it from row to row."""
         pose = torch.cat([self.R_wc, self.centre[..., None]], -1).flatten(-2)
         k = self.intrinsics[:, None].expand(-1, pose.shape[1], -1)
         sweep = torch.zeros_like(pose[..., :6]) if self.sweep is None else self.sweep
@@ -51,7 +51,7 @@ class CameraBatch:
         return torch.cat([pose, k, sweep, row], -1).float().contiguous()
 
     def as_rooms(self) -> "CameraBatch":
-        """Each view alone in a room of its own."""
+        """One room for each view."""
         sweep = None if self.sweep is None else self.sweep.flatten(0, 1)[:, None]
         intrinsics = self.intrinsics.repeat_interleave(self.T_cw.shape[1], 0)
         return CameraBatch(
@@ -59,7 +59,7 @@ class CameraBatch:
         )
 
     def row_fraction(self, y: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows 1"]:
-        """When a row is read, from -1/2 to 1/2; a row may lie outside by half an image."""
+        """Time at which a row is read, from -1/2 to 1/2; a row may lie outside by half an image."""
         return (y / max(self.height - 1, 1) - 0.5).clamp(-1, 1)[..., None]
 
     def swept(self, view: int) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 3"]]:
@@ -117,7 +117,7 @@ def row_centre(
 def _pinhole(
     views: CameraBatch, point: Float[Tensor, "b m 3"]
 ) -> tuple[Float[Tensor, "b m 2"], Bool[Tensor, "b m"]]:
-    """Pixels of points in the frame of a camera."""
+    """Pixels of points in the frame of a camera, and which lie before it."""
     x, y, z = point.unbind(-1)
     fx, fy, cx, cy = views.intrinsics[:, :, None].unbind(1)
     safe = z.clamp_min(MIN_Z)

@@ -15,16 +15,16 @@ class DepthSensor:
     """A sensor of inverse depth with the numbers of a first Kinect."""
 
     deviation: float = 0.0015
-    """Deviation of inverse depth, per metre: depth errs with its square."""
+    """Standard deviation of inverse depth, per metre: the error of depth grows with its square."""
     step: float = 0.0028
-    """Inverse depth from one level to the next, per metre."""
+    """Difference of inverse depth from one level to the next, per metre."""
     lateral: float = 0.7
-    """Deviation in pixels of where a depth is seen."""
+    """Standard deviation of the pixel at which a depth is measured, pixels."""
     near: float = 0.4
     far: float = 5.0
-    """Metres between which it sees anything."""
+    """Range of depths that are measured, metres."""
     grazing: float = 80.0
-    """Degrees between a ray and a surface's normal beyond which it sees nothing."""
+    """Largest angle between a ray and a surface's normal that is measured, degrees."""
     lost_at_edges: float = 0.5
     """Fraction of the pixels at a step of depth that are holes."""
 

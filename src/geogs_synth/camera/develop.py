@@ -10,9 +10,9 @@ from geogs_synth.camera.random_flaws import RandomFlaws
 from geogs_synth.draw import Draw
 
 _MIDDLE = 0.2
-"""Brightness of a clip before its exposure is off."""
+"""Brightness of a clip before its exposure is disturbed."""
 _KNEE = 0.6
-"""Brightness from which on highlights are compressed instead of clipped."""
+"""Brightness above which highlights are compressed instead of clipped."""
 
 
 def develop(

@@ -1,4 +1,4 @@
-"""What a real camera does to its images, as numbers; every flaw is off by default."""
+"""Flaws of a real camera, as numbers; every flaw is off by default."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -8,7 +8,7 @@ from geogs.geometry.camera import Camera
 from geogs_synth.camera.flaws import Flaws
 
 _PERIODS = np.array([1.7, 2.9, 5.3])
-"""Seconds of the waves that the automatic exposure and white balance follow."""
+"""Periods of the waves that the automatic exposure and white balance follow, seconds."""
 _DRIFT_STREAM, _NOISE_STREAM = 0xD1F, 0x401
 
 
@@ -25,7 +25,7 @@ class Sensor:
     def develop(
         self, light: Float32[np.ndarray, "h w 3"], frame: int, time: float
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """The image of linear light in [0, 1], taken as frame number ``frame`` at ``time`` s.
+        """Return the image of linear light in [0, 1], taken as frame ``frame`` at ``time`` s.
 
         Display gamma is 2, so that the shot noise of the light, whose variance grows with the
         light, has the same deviation at every grey level.

@@ -10,13 +10,13 @@ from geogs_synth.camera.camera_batch import CameraBatch
 
 _TAPS = 11
 _MOST = 40.0
-"""Pixels of blur at most."""
+"""Largest blur, pixels."""
 
 
 def exposed(
     colour: Float[Tensor, "b v 3 h w"], blur: Float[Tensor, "b v h w 2"]
 ) -> Float[Tensor, "b v 3 h w"]:
-    """The mean of linear light along the motion of each pixel, which is centred on it."""
+    """Mean linear light along each pixel's motion, which is centred on the pixel."""
     b, v, _, h, w = colour.shape
     way = blur.flatten(0, 1).clamp(-_MOST, _MOST)
     step = torch.stack([way[..., 0] * (2 / w), way[..., 1] * (2 / h)], -1)

@@ -9,14 +9,14 @@ from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.radial_camera import RadialCamera
 
 _FOCUS_PERIODS = np.array([1.1, 2.3, 4.7])
-"""Periods in seconds of the waves in which it is focused."""
+"""Periods of the waves of the focus, seconds."""
 _SHAKE_PERIODS = np.array([0.17, 0.31, 0.7])
-"""Periods in seconds of a hand's shake, against which it is moved."""
+"""Periods of a hand's shake, which the stabilisation counteracts, seconds."""
 _STREAM = 0x1E5
 
 
 class MovingLens:
-    """Changes its focal length as it is focused, and its principal point as it is stabilised."""
+    """A lens whose focal length changes by focusing, its principal point by stabilisation."""
 
     def __init__(self, lens: RadialCamera, flaws: Flaws, seed: int = 0) -> None:
         self._lens, self._flaws = lens, flaws
@@ -24,7 +24,7 @@ class MovingLens:
 
     @property
     def is_still(self) -> bool:
-        """Whether nothing of it changes."""
+        """Whether its intrinsics are constant."""
         return self._flaws.focusing == 0 and self._flaws.stabilisation == 0
 
     def in_rows(self, times: Float64[np.ndarray, "h"]) -> RadialCamera:
@@ -42,7 +42,7 @@ class MovingLens:
         return replace(self._lens, camera=replace(self._lens.camera, fx=fx, fy=fy, cx=cx, cy=cy))
 
     def _intrinsics(self, times: Float64[np.ndarray, "t"]) -> Float64[np.ndarray, "t 4"]:
-        """fx, fy, cx and cy at some seconds."""
+        """fx, fy, cx and cy at times in seconds."""
         flaws, camera = self._flaws, self._lens.camera
         focus = _wave(times, _FOCUS_PERIODS, self._phases[0])
         right, down = (_wave(times, _SHAKE_PERIODS, phase) for phase in self._phases[1:])
@@ -64,7 +64,7 @@ class _LensInRows(RadialCamera):
 
     @property
     def is_distorted(self) -> bool:
-        """Straight lines look bent where it moves."""
+        """True: straight lines look bent where the lens moves."""
         return True
 
     @property
@@ -79,6 +79,6 @@ def _wave(
     periods: Float64[np.ndarray, "k"],
     phases: Float64[np.ndarray, "k"],
 ) -> Float64[np.ndarray, "t"]:
-    """Between -1 and 1."""
+    """Mean of the sines, between -1 and 1."""
     waves: Float64[np.ndarray, "t"] = np.sin(2 * np.pi * times[:, None] / periods + phases).mean(1)
     return waves

@@ -102,7 +102,7 @@ class RadialCamera:
 
     @property
     def _planes(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-        """What :attr:`rays` are where nothing is distorted."""
+        """Undistorted :attr:`rays`."""
         x, y = np.meshgrid(*self._axes)
         return x, y
 

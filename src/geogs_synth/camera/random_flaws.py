@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs_synth.draw import Draw
 
 TAPS = 9
-"""Displaced images whose mean is a blurred one."""
+"""Number of displaced images whose mean is a blurred one."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,16 @@ class RandomFlaws:
     saturation: Float[Tensor, "n"]
     """Factor on the distance from grey."""
     shot: Float[Tensor, "n"]
-    """Deviation of the noise that grows with brightness, at white."""
+    """Standard deviation, at white, of the noise that grows with brightness."""
     read: Float[Tensor, "n"]
-    """Deviation of the noise that is everywhere."""
+    """Standard deviation of the noise that does not depend on brightness."""
     compression: Float[Tensor, "n"]
     """Quantisation step of lossy compression in 8-bit levels; 0 for none."""
 
 
 @dataclass(frozen=True)
 class _ClipFlaws:
-    """How much each of b clips is disturbed."""
+    """Strength of the flaws of each of b clips."""
 
     strength: Float[Tensor, "b"]
     """0 is clean, 1 as in a poor video."""

@@ -1,4 +1,4 @@
-"""Short clips of random rooms with exact geometry: what the trainer gets."""
+"""Short clips of random rooms with exact geometry: the trainer's input."""
 
 from dataclasses import dataclass
 
@@ -19,21 +19,21 @@ class ClipBatch:
     images: Float[Tensor, "b v 3 h w"]
     """RGB in 0..1, in 8-bit steps, as a camera with noise, blur and artefacts takes them."""
     light: Float[Tensor, "b v 3 h w"]
-    """The same as linear light, before the camera: what there is to see."""
+    """The same scene as linear light, before the camera."""
     depth: Float[Tensor, "b v h w"]
     """z along the optical axis in metres, exact at the (integer) pixel centres."""
     normal: Float[Tensor, "b v 3 h w"]
     """Unit, camera frame, facing the camera, exact at the pixel centres."""
     solid: Int[Tensor, "b v h w"]
-    """Place of the solid that each pixel shows; -1 for the room itself."""
+    """Index of the solid that each pixel shows; -1 for the room itself."""
     views: CameraBatch
     solids: SolidBatch
-    """What stands in the rooms when the first view is taken; hides points from views."""
+    """Solids of the rooms at the time of the first view; they hide points from views."""
     dynamics: Dynamics | None = None
-    """What is unusual; None where nothing is."""
+    """Motion and kinds of the scenes; None where all are usual."""
 
     def flow(self, first: int, second: int) -> FlowTruth:
-        """Where the points that the view ``first`` sees are in the view ``second``."""
+        """Pixels in the view ``second`` of the points that the view ``first`` sees."""
         points, solids = self.points(first), self.solids
         if self.dynamics is not None:
             points = points + (second - first) * self.dynamics.velocity_of(self.solid[:, first])
@@ -41,12 +41,12 @@ class ClipBatch:
         return caster_for(points.device).flow(solids, self.views, points, second)
 
     def still_flow(self, points: Float[Tensor, "b h w 3"], second: int) -> Float[Tensor, "b h w 2"]:
-        """Where what is at these points would be in a view if nothing but the camera moved."""
+        """Pixels of these points in the view ``second`` if only the camera moved."""
         pixels, _ = project(self.views, second, points.flatten(1, 2))
         return pixels.unflatten(1, points.shape[1:3])
 
     def points(self, view: int) -> Float[Tensor, "b h w 3"]:
-        """What a view sees, world frame."""
+        """Points that the pixels of a view see, world frame."""
         depth = self.depth[:, view]
         origin, direction = rays(self.views, view, *pixel_grid(self.views))
         return (origin + depth.flatten(1)[..., None] * direction).unflatten(1, depth.shape[1:])

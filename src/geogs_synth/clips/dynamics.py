@@ -1,4 +1,4 @@
-"""What is unusual in a batch of scenes: kinds, things that move, cameras that move as they look."""
+"""Kinds of the scenes of a batch, moving objects, and cameras that move during the exposure."""
 
 from dataclasses import astuple, dataclass, replace
 
@@ -24,13 +24,13 @@ from geogs_synth.scene.solids import NONE, SolidBatch, Solids
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What is unusual in each of b clips."""
+    """Kind, camera shake and moving objects of each of b clips."""
 
     kind: Int[Tensor, "b"]
     """Kind of the scene, its number in :mod:`geogs_synth.clips.room_options`."""
     shake: Shake
     velocity: Float[Tensor, "b n 3"]
-    """Velocity of the solid in each place, metres from view to view."""
+    """Velocity of each solid, metres from view to view."""
 
     def velocity_of(self, solid: Int[Tensor, "b *s"]) -> Float[Tensor, "b *s 3"]:
         """Velocity of the solids that pixels show; zero for the room itself."""
@@ -39,13 +39,13 @@ class Dynamics:
         return velocity[rows.reshape(-1, *[1] * (solid.ndim - 1)), solid + 1]
 
     def out_of_the_way(self, solids: SolidBatch, views: CameraBatch) -> SolidBatch:
-        """Without what comes too near to a camera on its way."""
+        """Return the solids without those that come too near to a camera on their way."""
         for step in range(1, views.T_cw.shape[1]):
             solids = solids.without(too_near(solids.moved_by(self.velocity, step), views))
         return solids
 
     def blurred(self, rendering: RenderedRooms, views: CameraBatch) -> Float[Tensor, "b v 3 h w"]:
-        """The light of views while their shutters are open."""
+        """Mean light of the views while their shutters are open."""
         shake = self.shake
         camera = shake.rate * shake.exposure[..., None]
         fraction = (shake.objects[:, None] * shake.exposure)[..., None, None, None]
@@ -56,7 +56,7 @@ class Dynamics:
 def draw_dynamics(
     draw: Draw, options: RoomOptions, rooms: Rooms, paths: Paths, materials: int
 ) -> tuple[Rooms, Paths, Dynamics]:
-    """Turns some of the usual rooms, and paths in them, into other kinds of scenes; on the host."""
+    """Change some of the usual rooms, and their paths, into other kinds of scenes; on the host."""
     b, places = rooms.solids.kind.shape
     kind = draw.choose(astuple(options.scenes), b)
     surfaces = papered(draw, rooms.surfaces, kind == PAPERED)
@@ -80,7 +80,7 @@ def _with_bodies(
     velocity: Float[Tensor, "b k 3"],
     which: Bool[Tensor, "b"],
 ) -> tuple[SolidBatch, Float[Tensor, "b n 3"]]:
-    """Bodies in the last places of some scenes, and the velocities of all solids."""
+    """Replace the last solids of some scenes by bodies; return all solids and their velocities."""
     count = BODIES * PARTS
     rest = solids.at(torch.arange(solids.kind.shape[1] - count))
     found = where(which, Solids.join([rest, bodies]), solids)

@@ -1,4 +1,4 @@
-"""Furniture and other things in random rooms, and where they stand."""
+"""Furniture and other objects in random rooms, and their poses."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -15,32 +15,32 @@ from geogs_synth.scene.solids import NONE, SolidBatch, Solids
 
 @dataclass(frozen=True)
 class Furnishing:
-    """Solids of b rooms, and which of the n places belong together."""
+    """n solids of b rooms, and which of them belong together."""
 
     solids: SolidBatch
     material: Int[Tensor, "n"]
-    """The place whose surfaces a place shares; its own for most."""
+    """Index of the solid whose surfaces a solid shares; its own for most."""
     picture: Bool[Tensor, "n"]
-    """Whether it hangs flat on a wall and shows an image."""
+    """Whether a solid hangs flat on a wall and shows an image."""
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Places that hold pieces of one kind."""
+    """Solids of pieces of one kind."""
 
     solids: SolidBatch
     per_material: int
-    """So many consecutive places have one material."""
+    """Number of consecutive solids of one material."""
     picture: int = 0
-    """Every so many-th place is a picture; 0 for none."""
+    """Distance from picture to picture in the list of solids; 0 for none."""
 
 
 def draw_furnishing(
     draw: Draw, size: Float[Tensor, "b 3"], least: float, most: float, thin: float = 0.0
 ) -> Furnishing:
-    """Furnishes rooms of these sizes; the densities are those of :class:`RoomOptions`.
+    """Furnish rooms of these sizes; the densities are those of :class:`RoomOptions`.
 
-    Where there may be thin things there are twice as many places."""
+    With thin things there are twice as many slots for solids."""
     b = len(size)
     density = draw.uniform(least, most, b)[:, None]
     cupboards = pieces.cupboards(draw, size, 8)
@@ -51,7 +51,7 @@ def draw_furnishing(
     floor = loose.floor(size)
     supports = [(cupboards, standing[0], 0), (tables, standing[1], 0)]
     supports += [(shelves, standing[2], k) for k in range(BOARDS)]
-    # What would stand on a piece that is not there stands on the floor.
+    # Things that would stand on a missing piece stand on the floor.
     faces = torch.cat(
         [torch.where(there[..., None], pieces.tops(p, k), floor) for p, there, k in supports], 1
     )
@@ -98,17 +98,17 @@ def _thin_things(draw: Draw, size: Float[Tensor, "b 3"], most: float) -> tuple[_
 
 
 def _drawn(draw: Draw, placed: StandingPiece, density: Float[Tensor, "b 1"]) -> Bool[Tensor, "b k"]:
-    """Which of the pieces are there, at random."""
+    """Mask of the pieces that are there, at random."""
     return draw.uniform(0, 1, *placed[1].yaw.shape) < density
 
 
 def _some(draw: Draw, density: Float[Tensor, "b 1"], placed: StandingPiece) -> SolidBatch:
-    """The solids of the pieces that are there."""
+    """The solids of pieces, some of which are left out at random."""
     return _put(placed, _drawn(draw, placed, density))
 
 
 def _put(placed: StandingPiece, there: Bool[Tensor, "b k"]) -> SolidBatch:
-    """The solids of pieces in their places; some of the pieces are not there."""
+    """The solids of pieces at their poses; those that are not ``there`` are empty."""
     piece, place = placed
     R = about_z(place.yaw)[:, :, None]
     centre = (R @ piece.centre[..., None])[..., 0] + place.position[:, :, None]

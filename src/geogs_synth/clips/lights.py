@@ -31,7 +31,7 @@ def _draw(draw: Draw, size: Float[Tensor, "b 3"]) -> Lights:
     white = 1 + warmth * torch.tensor([1.0, 0.1, -1.0])
     power = there * draw.log_uniform(0.7, 6.0, *n)
     above = draw.log_uniform(0.15, 1.0, b, 1, 1) * (1 + draw.uniform(-0.12, 0.12, b, 1, 3))
-    # What comes up from the floor is weaker and of another colour.
+    # Light from the floor is weaker and of another colour.
     floor = draw.uniform(0.4, 0.9, b, 1, 1) * (1 + draw.uniform(-0.12, 0.12, b, 1, 3))
     return Lights(
         position=position * size[:, None, None],

@@ -1,4 +1,4 @@
-"""Things that stand on others, lean or hang: clutter, rows of books, wires, rotated slabs."""
+"""Objects that stand on others, lean or hang: clutter, rows of books, wires, rotated slabs."""
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids
 Tops = Float[Tensor, "b t 6"]
 """Faces to stand on: centre (3), yaw, half extents (2)."""
 _BOOKS = 6
-"""In a row."""
+"""Books in a row."""
 
 
 def clutter(draw: Draw, supports: Tops, count: int) -> SolidBatch:
@@ -67,7 +67,7 @@ def slabs(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
 
 
 def floor(size: Float[Tensor, "b 3"]) -> Tops:
-    """The floor as something to stand on."""
+    """The floor as a face to stand on."""
     middle, zero = 0.5 * size[:, :2], torch.zeros(len(size), 2)
     return torch.cat([middle, zero, middle], -1)[:, None]
 

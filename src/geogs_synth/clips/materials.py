@@ -12,7 +12,7 @@ from geogs_synth.scene.batch import concatenate, gather
 from geogs_synth.scene.rooms import Surfaces
 
 _PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
-"""Fraction of the walls, the floor and the ceiling that have next to no texture."""
+"""Fraction of each wall, the floor and the ceiling that has next to no texture."""
 _PLAIN_SOLID = 0.35
 _SHOWS_IMAGE = (0.12, 0.12, 0.12, 0.12, 0.12, 0.04)
 """Fraction of them that show images rather than materials."""
@@ -24,7 +24,7 @@ _PERIOD = (0.06, 0.7)
 def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int) -> Surfaces:
     """Appearance of the room's six faces and of two surfaces of each solid.
 
-    Of the ``textures`` in the bank the first ``materials`` are materials, the others images.
+    The first ``materials`` of the ``textures`` in the bank are materials, the others images.
     """
     b, n = layout.solids.kind.shape
     plain = draw.uniform(0, 1, b, 6) < torch.tensor(_PLAIN)
@@ -100,7 +100,7 @@ def _matrix(scale: Float[Tensor, "b s"], angle: Float[Tensor, "b s"]) -> Float[T
 def _show_pictures(
     draw: Draw, surfaces: Surfaces, layout: Furnishing, images: Int[Tensor, "b s"]
 ) -> Surfaces:
-    """What hangs on a wall shows about one image; some of it is a bright window or screen."""
+    """Give solids on a wall about one image each; some are a bright window or screen."""
     picture = layout.picture.repeat_interleave(2)
     half = layout.solids.half.repeat_interleave(2, 1)
     b, n = half.shape[:2]
@@ -121,7 +121,7 @@ def _show_pictures(
 
 
 def papered(draw: Draw, surfaces: Surfaces, which: Bool[Tensor, "b"]) -> Surfaces:
-    """The walls, and half of the floors, of these rooms repeat one image exactly, often."""
+    """Repeat one image exactly, often, on the walls, and half of the floors, of these rooms."""
     b = len(which)
     half = torch.tensor([True] * 4 + [False, False]).expand(b, 6) & which[:, None]
     floor = torch.tensor([False] * 4 + [True, False]).expand(b, 6)
@@ -140,7 +140,7 @@ def papered(draw: Draw, surfaces: Surfaces, which: Bool[Tensor, "b"]) -> Surface
 
 
 def bared(draw: Draw, surfaces: Surfaces, which: Bool[Tensor, "b"]) -> Surfaces:
-    """All of the rooms' faces and most solids of these rooms are of one colour, or nearly."""
+    """Give nearly all faces and most solids of these rooms one colour, or nearly."""
     b, s = surfaces.contrast.shape
     chosen = draw.chance(0.75, b, s)
     chosen[:, :6] = draw.chance(0.95, b, 6)

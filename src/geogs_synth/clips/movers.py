@@ -13,7 +13,7 @@ from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import ELLIPSOID, FRUSTUM, NONE, SolidBatch, Solids
 
 BODIES, PARTS = 4, 3
-"""Bodies of a scene, solids of each; they take the last places."""
+"""Bodies of a scene, solids of each; they are its last solids."""
 
 
 def people(draw: Draw, size: Float[Tensor, "b 3"]) -> tuple[SolidBatch, Float[Tensor, "b parts 3"]]:
@@ -47,7 +47,7 @@ def _people(
 
 
 def traffic(draw: Draw, scenes: int) -> tuple[SolidBatch, Float[Tensor, "b parts 3"]]:
-    """Cars on the roads of street clips, and who walks beside them; their velocities per view."""
+    """Cars on the roads of street clips, and pedestrians; their velocities, metres per view."""
     n = (scenes, BODIES)
     x = draw.uniform(-12, 60, *n) * (1 - 2.0 * draw.chance(0.3, *n))
     foot = torch.stack([x, draw.uniform(-7, 7, *n)], -1)

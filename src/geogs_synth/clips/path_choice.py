@@ -13,13 +13,13 @@ from geogs_synth.raycast.solid_distance import signed_distance, wall_distance
 from geogs_synth.scene.solids import SolidBatch
 
 _CLEARANCE = 0.15
-"""Metres between a camera and everything."""
+"""Least distance between a camera and everything, metres."""
 _LEAST_OVERLAP = 0.5
-"""Fraction of a view's points that the next view must have in its image."""
+"""Least fraction of a view's points that the next view must have in its image."""
 _FAN = (6, 5)
-"""Rays across and down that say what a candidate sees."""
+"""Rays across and down that measure the depths a candidate sees."""
 _NEAREST, _MEAN_DEPTH = 0.25, (0.5, 6.0)
-"""Metres."""
+"""Least depth, and range of the mean depth, metres."""
 _SKY = 12.0
 """Metres beyond which something is no part of a room and does not count as seen."""
 
@@ -37,7 +37,7 @@ class _Sight:
 def choose_cameras(
     paths: Paths, size: Float[Tensor, "b 3"], solids: SolidBatch, width: int, height: int
 ) -> CameraBatch:
-    """The path that each room is filmed from; consecutive views overlap."""
+    """Choose the path from which each room is filmed; consecutive views overlap."""
     clear = _clearance(paths, size, solids)
     sight = _look(paths, size, solids, width, height)
     near = (sight.depth < _SKY).float()
@@ -46,7 +46,7 @@ def choose_cameras(
     overlap = _overlap_with_next(paths, sight, width, height) > _LEAST_OVERLAP
     good = (clear > _CLEARANCE) & fair.all(-1) & overlap.all(-1)
     crowded = good & (sight.crowd >= paths.crowd[:, None])
-    # Where none is good, the freest is taken; what is still too near to it is taken away later.
+    # Where none is good, take the freest; solids that are too near to it are removed later.
     order = torch.arange(clear.shape[1], device=size.device)
     rank = torch.where(good, 200.0 + 100.0 * sight.crowd, clear.clamp(-10, 10))
     best = torch.where(crowded, 1000.0 - order, rank).argmax(1)

@@ -1,4 +1,4 @@
-"""Candidate camera paths through random rooms, of which ``path_choice`` takes one."""
+"""Candidate camera paths through random rooms; ``path_choice`` takes one."""
 
 import math
 from dataclasses import astuple, dataclass
@@ -22,7 +22,7 @@ class Paths:
     intrinsics: Float[Tensor, "b 4"]
     """fx fy cx cy in pixels."""
     crowd: Float[Tensor, "b"]
-    """Fraction of the image that things other than the walls should fill."""
+    """Fraction of the image that solids should fill."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ _KINDS = (
     _Motion((1e-4, 2e-4), 20.0, (0.0, 0.0)),
     _Motion((0.1, 0.8), 4.0, (0.0, 1.0), along_axis=1.0),
 )
-"""In the order of :class:`MotionWeights`."""
+"""Ranges of each kind, in the order of :class:`MotionWeights`."""
 
 
 @dataclass(frozen=True)
 class _PathSteps:
-    """How each of k candidates moves away from its first pose."""
+    """Motion of each of k candidates away from its first pose."""
 
     translation: Float[Tensor, "b k 3"]
     """Metres, world frame."""
@@ -62,7 +62,7 @@ class _PathSteps:
 
 
 def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> Paths:
-    """Candidates anywhere in the rooms, without regard to what stands there."""
+    """Candidates anywhere in the rooms, without regard to the solids there."""
     b, k, v = len(size), options.candidates, options.views
     start = draw.uniform(0, 1, b, k, 3) * (size - 0.4)[:, None] + 0.2
     start[..., 2] = torch.minimum(draw.uniform(0.4, 2.0, b, k), size[:, 2:] - 0.2)
@@ -99,7 +99,7 @@ def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tenso
 
 
 def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _PathSteps:
-    """All candidates of a room move in the same manner, so that none is taken less often."""
+    """Draw steps; all candidates of a room have one kind of motion, or some would be rarer."""
     b, k = forward.shape[:2]
     kind = draw.choose(astuple(weights), b)
     rows = [[*m.length, m.rotation, *m.hold, m.along_axis] for m in _KINDS]
@@ -123,7 +123,7 @@ def _keep_in_view(
     start: Float[Tensor, "b k 3"],
     hold: Float[Tensor, "b k"],
 ) -> Float[Tensor, "b k v 3 3"]:
-    """Views turned by a fraction of what brings the point seen first back to its pixel."""
+    """Rotate views by a fraction of the rotation that keeps the point seen first at its pixel."""
     before = (seen - start)[:, :, None].expand_as(centre)
     now = torch.nn.functional.normalize(seen[:, :, None] - centre, dim=-1)
     before = torch.nn.functional.normalize(before, dim=-1)

@@ -15,13 +15,13 @@ from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids, upright
 
 BOARDS, LEAVES = 5, 7
-"""Number of boards of a shelf, of leaves of a plant."""
+"""Numbers of boards of a shelf and of leaves of a plant."""
 Numbers = Float[Tensor, "b k"]
 
 
 @dataclass(frozen=True)
 class FloorPose:
-    """Where k pieces stand."""
+    """Poses of k pieces on the floor."""
 
     position: Float[Tensor, "b k 3"]
     """World, metres."""
@@ -30,7 +30,7 @@ class FloorPose:
 
 
 StandingPiece = tuple[SolidBatch, FloorPose]
-"""k pieces of p solids in the frame of their piece (b k p), and where they stand."""
+"""k pieces of p solids in the frame of their piece (b k p), and their poses."""
 
 
 def stand(
@@ -152,7 +152,7 @@ def lamps(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
 
 
 def pictures(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
-    """A frame and what it shows, thin boxes on a wall: pictures, windows, doors, switches."""
+    """Thin boxes on a wall, a frame and a panel: pictures, windows, doors, switches."""
     n = (len(size), count)
     w, h = draw.log_uniform(0.05, 0.8, *n), draw.log_uniform(0.05, 0.8, *n)
     door = draw.chance(0.15, *n)

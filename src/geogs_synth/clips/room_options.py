@@ -1,4 +1,4 @@
-"""What the random rooms and the clips filmed in them are like."""
+"""Options of the random rooms and of the clips filmed in them."""
 
 from dataclasses import dataclass, fields
 from typing import Annotated

@@ -26,20 +26,20 @@ from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
 
 _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
-"""Sizes of rooms, metres."""
+"""Least and largest size of a room, metres."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything random of a batch except the noise of its pixels; on the host."""
+    """All random parts of a batch except the noise of its pixels; on the host."""
 
     key: tuple[int, ...]
-    """What the random numbers depend on."""
+    """Key of the random numbers."""
     rooms: Rooms
     paths: Paths
     flaws: RandomFlaws
     dynamics: Dynamics | None = None
-    """What is unusual; None where nothing is."""
+    """Motion and kinds of the scenes; None where all are usual."""
 
 
 class RoomSampler:
@@ -61,20 +61,20 @@ class RoomSampler:
         )
 
     def sample(self, step: int, batch: int, rank: int = 0) -> ClipBatch:
-        """``batch`` clips for a training step of a process; the same whenever it is asked for.
+        """``batch`` clips for a training step of a process; the same at every call.
 
-        The rooms are the same on every device, only the noise differs. Nothing waits for the
-        device.
+        The rooms are the same on every device, only the noise differs. The host does not wait for
+        the device.
         """
         return self.film(self.plan(step, batch, rank))
 
     def plan(self, step: int, batch: int, rank: int = 0) -> Plan:
-        """What :meth:`sample` draws on the host."""
+        """The part of :meth:`sample` that is drawn on the host."""
         return draw_plan(self.options, self.bank.materials, self.seed, step, batch, rank)
 
     @torch.no_grad()
     def film(self, plan: Plan) -> ClipBatch:
-        """The clips of a plan."""
+        """Render the clips of a plan."""
         options, key = self.options, plan.key
         plan = on_device(plan, self.device)
         size, solids = plan.rooms.size, plan.rooms.solids
@@ -100,7 +100,7 @@ class RoomSampler:
     def _render_moving(
         self, rooms: Rooms, views: CameraBatch, velocity: Float[Tensor, "b n 3"]
     ) -> RenderedRooms:
-        """What every view sees where solids move by ``velocity`` (metres per view)."""
+        """Render every view of rooms whose solids move by ``velocity`` (metres per view)."""
         b, v = views.T_cw.shape[:2]
         rooms = room_per_view(rooms, v, velocity)
         seen = caster_for(self.device).render(rooms, self.bank, views.as_rooms())

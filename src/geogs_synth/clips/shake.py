@@ -1,4 +1,4 @@
-"""How cameras move while an image is taken, by rolling shutter and over the exposure."""
+"""Camera motion while an image is taken: over the rolling shutter and over the exposure."""
 
 import math
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from geogs_synth.clips.room_options import SHAKEN, STREET
 from geogs_synth.draw import Draw
 
 _ROTATION = (0.15, 2.5)
-"""Degrees about each axis in the time in which all rows are read."""
+"""Rotation about each axis during the readout of an image, degrees."""
 _TRANSLATION = (0.001, 0.02)
-"""Metres along each axis in this time, in rooms."""
+"""Translation along each axis during the readout, in rooms, metres."""
 _DRIVE = (0.01, 0.06)
-"""The same along the optical axis on a street."""
+"""The same along the optical axis on a street, metres."""
 _OFTEN = 0.4
 """Fraction of the clips of other kinds in which the camera moves, too."""
 
@@ -31,7 +31,7 @@ class Shake:
     exposure: Float[Tensor, "b v"]
     """Exposure time of each row."""
     objects: Float[Tensor, "b"]
-    """Readout over the time from view to view, by which objects move."""
+    """Ratio of the readout to the time from view to view, over which objects move."""
 
     @property
     def sweep(self) -> Float[Tensor, "b v 6"]:
@@ -40,13 +40,13 @@ class Shake:
 
 
 def draw_shake(draw: Draw, kind: Int[Tensor, "b"], views: int) -> Shake:
-    """Motion in shaken clips and in some of the kinds after it, none in usual ones."""
+    """Draw motion for shaken clips and for some of the kinds after it, none for usual ones."""
     b, n = len(kind), (len(kind), views)
     shaken = (kind == SHAKEN) | ((kind > SHAKEN) & draw.chance(_OFTEN, b))
     street = (kind == STREET)[:, None, None]
 
     def vary(size: Tensor) -> Tensor:
-        """Similar in the views of a clip."""
+        """Random values of this size, similar in the views of a clip."""
         whole = 0.6 * draw.normal(1.0, b, 1, 3) + 0.8 * draw.normal(1.0, *n, 3)
         return size[:, None, None] * whole
 

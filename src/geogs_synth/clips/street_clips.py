@@ -1,7 +1,7 @@
 """Streets: houses, parked cars, trees and posts along a road, under a sky that is far away.
 
 A street is a room whose walls and ceiling are the sky. Lengths are a fifth of the real ones, so
-that what holds for rooms (clearances, softness of light) holds here.
+that the constants of rooms (clearances, softness of light) hold here.
 """
 
 import math
@@ -32,7 +32,7 @@ _SUN = 100.0
 def draw_street(
     draw: Draw, options: RoomOptions, count: int, places: int, materials: int
 ) -> tuple[Rooms, Paths]:
-    """``count`` streets with so many places for solids, and candidate paths along them."""
+    """``count`` streets of ``places`` solids (some empty), and candidate paths along them."""
     size = torch.tensor(_SIZE).expand(count, 3).clone()
     solids = _solids(draw, count, places)
     layout = Furnishing(solids, torch.arange(places), torch.zeros(places, dtype=torch.bool))
@@ -42,7 +42,7 @@ def draw_street(
 
 
 def _solids(draw: Draw, b: int, places: int) -> SolidBatch:
-    """Everything that stands on a street."""
+    """All solids of a street."""
     parts = [*_houses(draw, b), _cars(draw, b), _trees(draw, b), _posts(draw, b)]
     solids = Solids.join(parts)
     empty = places - solids.kind.shape[1]
@@ -51,7 +51,7 @@ def _solids(draw: Draw, b: int, places: int) -> SolidBatch:
 
 
 def placed_on_street(solids: SolidBatch) -> SolidBatch:
-    """Solids that are given in metres around a point of the road."""
+    """Scale and move solids that are given in metres around a point of the road."""
     middle = torch.tensor(_MIDDLE)
     return replace(solids, centre=SCALE * solids.centre + middle, half=SCALE * solids.half)
 
@@ -76,7 +76,7 @@ def _houses(draw: Draw, b: int) -> list[SolidBatch]:
 
 
 def _cars(draw: Draw, b: int) -> SolidBatch:
-    """Parked ones: a body and what is above it."""
+    """Parked cars: a body and a cabin above it."""
     n = (b, _CARS)
     half = torch.stack([
         draw.uniform(1.7, 2.6, *n), draw.uniform(0.8, 1.0, *n), draw.uniform(0.4, 0.6, *n)
@@ -114,12 +114,12 @@ def _posts(draw: Draw, b: int) -> SolidBatch:
 
 
 def _some(kind: int, there: Tensor, centre: Tensor, half: Tensor) -> SolidBatch:
-    """Upright solids of a kind, some of them not there."""
+    """Upright solids of a kind; those that are not ``there`` are empty."""
     return upright(torch.where(there, kind, NONE), centre, half)
 
 
 def _surfaces(draw: Draw, surfaces: Surfaces) -> Surfaces:
-    """A sky that shines by itself, ground with grain, fronts that show something."""
+    """A sky that shines by itself, ground with grain, fronts that show an image."""
     b, s = surfaces.contrast.shape
     face = torch.arange(s)
     sky = ((face < 6) & (face != 4)).expand(b, s)

@@ -1,4 +1,4 @@
-"""Things whose parts are thinner than the gaps between them: railings, lattices, cables, twigs."""
+"""Objects with parts thinner than the gaps between them: railings, lattices, cables, twigs."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import FRUSTUM, SolidBatch, Solids
 
 BALUSTERS, BARS, SEGMENTS, TWIGS = 12, 5, 5, 12
-"""Parts of a railing, of a lattice in each direction, of a cable, of a bush."""
+"""Numbers of parts of a railing, of a lattice in each direction, of a cable, of a bush."""
 
 
 def railings(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
@@ -80,7 +80,7 @@ def bushes(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
 
 
 def _lifted(draw: Draw, size: Float[Tensor, "b 3"], place: FloorPose, tall: Numbers) -> FloorPose:
-    """Half of the pieces, which are 2 ``tall`` high, somewhere above the floor."""
+    """Lift half of the pieces, which are 2 ``tall`` high, to a random height above the floor."""
     free = (size[:, 2:] - 2 * tall).clamp_min(0)
     lift = draw.chance(0.5, *tall.shape) * draw.uniform(0, 1, *tall.shape) * free
     return replace(place, position=place.position + functional.pad(lift[..., None], (2, 0)))

@@ -1,1 +1,1 @@
-"""How cameras move."""
+"""Motions of cameras."""

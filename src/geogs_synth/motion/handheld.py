@@ -28,9 +28,9 @@ class HandheldPath:
     """A walk around the middle of a room, looking across it.
 
     Position and look-at point follow smooth periodic splines through random knots, plus a little
-    hand shake that does not repeat; so the camera always moves sideways, never only turns, and
-    after ``frames_per_lap`` frames (at 30 a second) comes back to within centimetres of its first
-    view. It keeps 0.6 m from every surface.
+    hand shake that does not repeat; so the camera always moves sideways, never rotates in place,
+    and after ``frames_per_lap`` frames (at 30 a second) comes back to within centimetres of its
+    first view. It keeps 0.6 m from every surface.
     """
 
     def __init__(self, scene: Scene, seed: int = 0, frames_per_lap: int = FRAMES_PER_LAP) -> None:
@@ -38,17 +38,17 @@ class HandheldPath:
         self._seed = seed
         self._frames_per_lap = frames_per_lap
         self.position, self.target = _clear_splines(scene, seed, frames_per_lap)
-        """Splines of the camera and of what it looks at over one lap in [0, 1], without shake."""
+        """Splines of the camera and of its look-at point over one lap in [0, 1], without shake."""
 
     def __call__(self, times: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
         """Camera-to-world poses at times in seconds."""
         frames = FRAMES_PER_SECOND * times
         whole = np.rint(frames)
-        # A frame's time, as a rounded number of seconds, means the frame.
+        # Rounding makes the time of a frame, in seconds, that frame exactly.
         return self.at_frames(np.where(np.abs(frames - whole) < 1e-9, whole, frames))
 
     def at_frames(self, frames: Real[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
-        """Camera-to-world poses at numbers of frames, which need not be whole."""
+        """Camera-to-world poses at frame numbers, which need not be whole."""
         lap = frames / self._frames_per_lap
         T_wc = look_at(self.position(lap % 1.0), self.target(lap % 1.0))
         return with_shake(T_wc, self._seed, frames)
@@ -104,7 +104,7 @@ def look_at(
 def with_shake(
     T_wc: Float64[np.ndarray, "n 4 4"], seed: int, frames: Real[np.ndarray, "n"]
 ) -> Float64[np.ndarray, "n 4 4"]:
-    """Adds a smooth tremor: a cubic B-spline whose random coefficients act only locally.
+    """Add a smooth tremor: a cubic B-spline whose random coefficients act only locally.
 
     ``frames`` are the times of the poses in frames.
     """

@@ -1,4 +1,4 @@
-"""Names of the ways in which a camera is moved."""
+"""Names of the kinds of camera motion."""
 
 from typing import Literal, get_args
 
@@ -6,8 +6,8 @@ RoomMotionKind = Literal[
     "handheld", "slow-handheld", "handheld-5hz", "walking", "turning-30", "turning-60",
     "turning-120", "pure-rotation", "turn-away", "rest-start", "jerks", "still",
 ]  # fmt: skip
-"""Through a room."""
+"""Motions through a room."""
 ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
 MotionKind = Literal[RoomMotionKind, "dining", "driving", "corridor"]
-"""Through a room, around a table in a room of thin things, along a street, or along a corridor
-almost without texture."""
+"""Motions through a room, around a table in a room of thin things, along a street, or along a
+corridor almost without texture."""

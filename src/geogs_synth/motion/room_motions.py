@@ -1,4 +1,4 @@
-"""Ways in which a camera is moved through a room, each a pose for any time.
+"""Motions of a camera through a room, each a pose for any time.
 
 The first frame is at time 0. All keep clear of the furniture.
 """
@@ -22,37 +22,37 @@ from geogs_synth.scene.bodies import Path
 from geogs_synth.scene.textured_scene import Scene
 
 _SLOW = 4
-"""The slow path takes so many times longer."""
+"""Duration of the slow path over that of the usual one."""
 _ARM = 0.25
-"""Metres from the axis about which a person turns to the camera."""
+"""Distance from the axis about which a person turns to the camera, metres."""
 _EYE_HEIGHT = 1.5
 _WALK_LAP = 1.7
 """Laps of the hand-held path that one lap of the walk takes."""
 _STEP_RATE = 2.0
 """Steps a second; the body sways to either side once in two steps."""
 _BOB, _SWAY = 0.025, 0.02
-"""Metres to either side."""
+"""Amplitudes up and down, and sideways, metres."""
 _GAIT_DEGREES = 0.8
 _REST, _GETTING_GOING = 1.5, 1.0
-"""Seconds of standing still at the start, and until full speed."""
+"""Seconds of rest at the start, and from there to full speed."""
 _GOING, _STOPPING = 1.3, 0.4
-"""Seconds of walking before the camera stops to turn, and until it stands, or walks again."""
+"""Seconds of walking before the camera stops to turn, and to stop or to walk again."""
 _AWAY_DEGREES, _AWAY, _AWAY_HOLD = 120.0, 1.6, 0.2
-"""How far it turns, the seconds either way, and those between."""
+"""Rotation away in degrees, its seconds either way, and those between."""
 _JERK_PERIOD, _JERK_HALF_LENGTH = 0.9, 0.12
 _TURN_STREAM, _JERK_STREAM = 0x704, 0x3E6
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the camera is at any time, and how often it takes a frame."""
+    """Pose of the camera at any time, and its frame rate."""
 
     path: Path
     """Camera to world at times in seconds."""
     rate: float = FRAMES_PER_SECOND
     """Frames per second."""
     seconds: float = math.inf
-    """How long it lasts."""
+    """Duration."""
 
 
 def room_motion(kind: RoomMotionKind, scene: Scene, seed: int = 0) -> Motion:
@@ -89,7 +89,7 @@ def _slow(scene: Scene, seed: int) -> HandheldPath:
 
 
 def _walking(scene: Scene, seed: int) -> Path:
-    """Around the room, looking ahead and inwards, with the bob and sway of steps."""
+    """A walk around the room, looking ahead and inwards, with the bob and sway of steps."""
     handheld = HandheldPath(scene, seed)
     seconds_per_lap = _WALK_LAP * FRAMES_PER_LAP / FRAMES_PER_SECOND
     ahead = handheld.position.derivative()
@@ -111,7 +111,7 @@ def _walking(scene: Scene, seed: int) -> Path:
 
 
 def _turning(scene: Scene, seed: int, degrees_per_second: float) -> Path:
-    """On the spot: the camera at arm's length goes around the body, which wanders a little."""
+    """A turn on the spot: the camera at arm's length circles the body, which wanders a little."""
     rng = np.random.default_rng([seed, _TURN_STREAM])
     start, sense, phases = rng.uniform(0, 2 * np.pi), rng.choice((-1.0, 1.0)), rng.uniform(0, 6, 3)
     middle = scene.size[:2] / 2
@@ -131,7 +131,7 @@ def _turning(scene: Scene, seed: int, degrees_per_second: float) -> Path:
 
 
 def _pure_rotation(scene: Scene, seed: int) -> Path:
-    """A head on a tripod that looks around; its centre does not move at all."""
+    """Pure rotation on a tripod: the camera's centre does not move at all."""
     phases = np.random.default_rng([seed, _TURN_STREAM]).uniform(0, 2 * np.pi, 4)
     position = np.array([*(scene.size[:2] / 2), _EYE_HEIGHT])
 
@@ -151,7 +151,7 @@ def _pure_rotation(scene: Scene, seed: int) -> Path:
 
 
 def _turn_away(path: Path, seed: int) -> Path:
-    """Walks, stops, turns on the spot to what it has not seen yet, back again, and walks on."""
+    """Walk, stop, turn on the spot to an unseen part of the room, turn back, and walk on."""
     sense = np.random.default_rng([seed, _TURN_STREAM]).choice((-1.0, 1.0))
     standing = 2 * _AWAY + _AWAY_HOLD
 
@@ -169,7 +169,7 @@ def _turn_away(path: Path, seed: int) -> Path:
 
 
 def _from_rest(path: Path) -> Path:
-    """Stands perfectly still at first, then gets going."""
+    """Stand perfectly still at first, then start to move."""
 
     def rested(times: np.ndarray) -> np.ndarray:
         going = np.clip(times - _REST, 0, None)
@@ -180,7 +180,7 @@ def _from_rest(path: Path) -> Path:
 
 
 def _with_jerks(path: Path, seed: int) -> Path:
-    """Every second or so the camera is knocked by some degrees and centimetres, and comes back."""
+    """Knock the camera by some degrees and centimetres every second or so; it comes back."""
 
     def jerky(times: np.ndarray) -> np.ndarray:
         T_wc = path(times).copy()
@@ -199,7 +199,7 @@ def _with_jerks(path: Path, seed: int) -> Path:
 
 
 def _still(scene: Scene, seed: int) -> Path:
-    """On a tripod."""
+    """A camera at rest on a tripod."""
     T_wc = HandheldPath(scene, seed).at_frames(np.zeros(1))
 
     return lambda times: np.repeat(T_wc, len(times), 0)

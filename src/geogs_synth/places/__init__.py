@@ -1,1 +1,1 @@
-"""Rooms and streets, and what stands and moves in them."""
+"""Rooms and streets, with their furniture and moving objects."""

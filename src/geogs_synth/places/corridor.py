@@ -1,7 +1,7 @@
 """A corridor of white panels and tiles from a seed, and a walk along it.
 
-Hardly anything in it has texture in two directions: what is seen are the joints between panels,
-between tiles, and around doors.
+Hardly anything in it has texture in two directions: visible are the joints between panels, between
+tiles, and around doors.
 """
 
 import numpy as np
@@ -15,19 +15,19 @@ from geogs_synth.textures import patterns
 
 LENGTH = 26.0
 WALK_METRES = 20.0
-"""From the first frame to the last."""
+"""Length of the walk from the first frame to the last."""
 _HEIGHT = 2.6
 _START, _EYE_HEIGHT = 1.5, 1.5
 _SPEED, _RATE = 1.17, 15.0
 """Metres a second and frames a second: 7.8 cm from one frame to the next."""
 _LOOK_DEGREES, _LOOK_PERIOD = 9.0, 3.6
-"""How far the camera looks to either side, and the seconds from side to side and back."""
+"""Rotation of the camera to either side in degrees, and its period in seconds."""
 _TEXEL = 0.004
 _CORRIDOR_STREAM, _WALK_STREAM = 0xC0D, 0xC0E
 
 
 def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
-    """A corridor of so many metres; the same seed always gives the same corridor.
+    """A corridor of ``length`` metres; the same seed always gives the same corridor.
 
     Painted panels on the walls and under the ceiling, one tone each, with narrow joints; tiles on
     the floor; doors of one colour, lamps, at either end a door, and here and there a sign.
@@ -69,7 +69,7 @@ def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
 
 
 def walk(scene: Scene, seed: int = 0) -> Motion:
-    """A camera carried along the corridor, which looks a little to one side and to the other."""
+    """A walk along the corridor; the camera rotates a little to one side and to the other."""
     rng = np.random.default_rng([seed, _WALK_STREAM])
     phases, middle = rng.uniform(0, 2 * np.pi, 3), scene.size[1] / 2
 

@@ -39,7 +39,7 @@ def make_dining_room(seed: int = 0) -> Scene:
 def _furnish(
     wall: Wall, piece: int, rng: np.random.Generator, materials: Materials, height: float
 ) -> None:
-    """What stands before a wall, and pictures behind it."""
+    """Furnish a wall: a piece before it, and pictures behind the piece."""
     match piece:
         case 0:
             railing(wall.build.at(0, rng.uniform(0.4, 0.6)), rng, materials, 0.8 * wall.width)
@@ -86,7 +86,7 @@ def lattice(
 
 
 def _console(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
-    """A narrow high table on four thin legs, and what stands on it."""
+    """A narrow high table on four thin legs, with objects on it."""
     width, depth, height = rng.uniform(1.2, 1.6), 0.36, 0.8
     build.box((0, depth / 2, height - 0.015), (width, depth, 0.03), materials.walnut)
     furniture.four_legs(build, width, depth, height - 0.03, 0.03, materials.metal)
@@ -96,7 +96,7 @@ def _console(build: SceneBuilder, rng: np.random.Generator, materials: Materials
 
 
 def _table_and_chairs(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
-    """Six chairs, pushed under the table or turned a little, no two alike."""
+    """A table and six chairs, pushed under it or turned a little, no two alike."""
     width, depth = rng.uniform(1.5, 1.8), rng.uniform(0.85, 0.95)
     top = (width, depth, 0.03)
     build.box((0, 0, _TABLE_HEIGHT - 0.015), top, materials.walnut)

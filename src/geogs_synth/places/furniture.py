@@ -32,7 +32,7 @@ class Materials:
 
 
 def make_materials(build: SceneBuilder, rng: np.random.Generator) -> Materials:
-    """Draws the shared textures; their colours follow the generator."""
+    """Draw the shared textures; their colours depend on the generator."""
 
     def fabric(shape: tuple[int, int], scale: float) -> int:
         ground = patterns.random_colour(rng, (0.15, 0.55), (0.35, 0.75))

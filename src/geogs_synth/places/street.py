@@ -12,9 +12,9 @@ from geogs_synth.textures import artwork, facades, patterns
 
 LENGTH = 260.0
 DRIVE_METRES = 205.0
-"""From the first frame to the end of the drive."""
+"""Length of the drive from its first frame to its end."""
 LANE = -1.4
-"""Metres to the left of the middle of the road at which the camera drives."""
+"""Lateral position of the camera, metres to the left of the middle of the road."""
 DRIVE_RATE = 10.0
 
 _WIDTH, _HEIGHT = 46.0, 18.0
@@ -42,7 +42,7 @@ def on_road(x: Float64[np.ndarray, "n"], left: Float64[np.ndarray, "n"]) -> np.n
 
 
 def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
-    """A street of so many metres that bends gently; the same seed always gives the same street.
+    """A street of ``length`` metres that bends gently; the same seed always gives the same one.
 
     House fronts with windows on either side, a road with markings, pavements, parked cars, trees,
     poles with signs; above them the sky.
@@ -63,7 +63,7 @@ def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
 
 
 def drive(seed: int = 0) -> Motion:
-    """A camera on a car: 6 to 14 m/s in the right lane, with some steering and pitching."""
+    """A drive in the right lane: 6 to 14 m/s, with some steering and pitching."""
     rng = np.random.default_rng([seed, _DRIVE_STREAM])
     phases = rng.uniform(0, 2 * np.pi, 5)
 
@@ -83,7 +83,7 @@ def drive(seed: int = 0) -> Motion:
 
 
 def driven(times: Float64[np.ndarray, "n"], seed: int) -> Float64[np.ndarray, "n"]:
-    """Metres along the street that the camera has come at times in seconds."""
+    """Distance driven along the street at times in seconds, metres."""
     phase = float(np.random.default_rng([seed, _DRIVE_STREAM, 1]).uniform(0, 2 * np.pi))
     rate = 2 * np.pi / _SPEED_PERIOD
     wave = np.cos(phase) - np.cos(rate * times + phase)
@@ -98,14 +98,14 @@ def _seconds_of_drive(seed: int) -> float:
 def _section(
     build: SceneBuilder, x: float, left: float = 0.0, backwards: bool = False
 ) -> SceneBuilder:
-    """A frame beside the middle of the road: x along it, or against it where backwards."""
+    """A frame beside the middle of the road: x along it, or against it if ``backwards``."""
     at = np.array([x])
     (px, py), yaw = on_road(at, np.array([left]))[0], float(heading(at)[0])
     return build.at(float(px), float(py), yaw=yaw + (np.pi if backwards else 0.0))
 
 
 def _ground(build: SceneBuilder, rng: np.random.Generator, length: float) -> None:
-    """Bare ground far around, the road and the pavements in sections."""
+    """Bare ground all around, the road and the pavements in sections."""
     bare = build.texture(patterns.plaster(rng, (1024, 1024), (126, 122, 104)), 0.02)
     build.rectangle((length / 2, _WIDTH / 2, 0), (900, 700), bare, np.eye(3))
     surfaces = [build.texture(facades.road(rng, _SECTION + 0.6, 2 * _ROAD_HALF)) for _ in range(8)]
@@ -124,7 +124,7 @@ def _ground(build: SceneBuilder, rng: np.random.Generator, length: float) -> Non
 
 
 def _houses(build: SceneBuilder, rng: np.random.Generator, side: int, length: float) -> None:
-    """One after the other, some with a gap; their +y faces look to the road."""
+    """A row of houses, some with a gap; their +y faces look to the road."""
     plain = build.texture(patterns.plaster(rng, (512, 512), (160, 150, 138)), 0.01)
     front_at = _ROAD_HALF + _PAVEMENT
     x = 0.0
@@ -158,7 +158,7 @@ def _parked_cars(
 
 
 def _kerbside(build: SceneBuilder, rng: np.random.Generator, side: int, length: float) -> None:
-    """Trees and poles in turn along the pavement."""
+    """Trees and poles alternating along the pavement."""
     bark = build.texture(patterns.plaster(rng, (256, 256), (104, 84, 64)), 0.004)
     metal = build.texture(patterns.plaster(rng, (256, 256), (120, 124, 128)), 0.004)
     leaves = [

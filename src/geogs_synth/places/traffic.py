@@ -1,4 +1,4 @@
-"""Vehicles that move on the street: a van ahead and cars that come towards the camera."""
+"""Vehicles that move on the street: a van ahead and oncoming cars."""
 
 import math
 
@@ -36,7 +36,7 @@ def _shape(build: SceneBuilder) -> Scene:
 
 
 def _follows(gap: float, seed: int) -> Path:
-    """Ahead of the camera in its lane, a little nearer and farther in turn."""
+    """Path of the van: ahead of the camera in its lane, at a distance that varies a little."""
 
     def path(times: np.ndarray) -> np.ndarray:
         away = gap * (1 + _GAP_WAVE * np.sin(2 * np.pi * times / _GAP_PERIOD))
@@ -47,7 +47,7 @@ def _follows(gap: float, seed: int) -> Path:
 
 
 def _comes(part: float) -> Path:
-    """In the other lane, around and around; ``part`` of the street ahead of the first."""
+    """Path of an oncoming car, again and again, ``part`` of the street ahead of the first."""
 
     def path(times: np.ndarray) -> np.ndarray:
         return _placed((part * LENGTH - _ONCOMING_SPEED * times) % LENGTH, -LANE, np.pi)

@@ -27,7 +27,7 @@ class VehicleMaterials:
 def draw_materials(
     build: SceneBuilder, rng: np.random.Generator, colours: int = 12
 ) -> VehicleMaterials:
-    """Draws the shared textures."""
+    """Draw the shared textures."""
 
     def paint() -> int:
         colour = patterns.random_colour(rng, (0.05, 0.6), (0.3, 0.95))

@@ -14,15 +14,15 @@ from geogs_synth.textures import patterns
 
 _HEIGHT = 1.72
 _WIDTH = 0.42
-"""Metres across that a figure covers on average over its height."""
+"""Mean width of a figure over its height, metres."""
 _PACE = 1.2
-"""Metres per second, past a camera that does not turn."""
+"""Walking speed past a camera that does not rotate, metres per second."""
 _GROUPS = 3
 _PAIR_FROM = 0.16
-"""Fraction of the image from which two walk side by side, so that they need not be too near."""
+"""Coverage from which two walk side by side, so that they need not be too near."""
 _BOB, _STEP_RATE = 0.02, 1.8
 _KNOT_SECONDS = 0.5
-"""Walkers follow the camera's viewing direction smoothed over this time."""
+"""Smoothing of the camera's viewing direction that walkers follow, seconds."""
 _AWAY = -100.0
 """Height of figures that are not crossing: under the floor."""
 _STREAM = 0x9E0
@@ -31,14 +31,14 @@ _STREAM = 0x9E0
 def crossing_walkers(
     path: Path, seconds: float, camera: Camera, coverage: float, seed: int = 0
 ) -> list[Body]:
-    """People who pass by before a camera, one group after the other, from either side.
+    """People who pass before a camera, one group after the other, from either side.
 
     While it passes, a group covers about the fraction ``coverage`` of the image: that sets its
-    distance. They walk around the camera, so that one that turns sees them, too.
+    distance. They walk around the camera, so that a rotating camera sees them, too.
 
     Args:
         path: of the camera.
-        seconds: for which they are needed.
+        seconds: duration for which they are needed.
         camera: its intrinsics.
         coverage: fraction of the image, above 0 and at most 1/2.
         seed: of their appearance.
@@ -83,7 +83,7 @@ def _distance(T_wc: Float64[np.ndarray, "n 4 4"], camera: Camera, coverage: floa
 def _crossing(
     view: CubicSpline, group: int, aside: float, distance: float, reach: float, period: float
 ) -> Path:
-    """The way of one figure of a group; ``aside`` and ``reach`` in radians."""
+    """The path of one figure of a group; ``aside`` and ``reach`` in radians."""
 
     def path(times: np.ndarray) -> np.ndarray:
         turn = np.floor(times / period)
@@ -95,7 +95,7 @@ def _crossing(
         bob = _BOB * np.cos(2 * np.pi * _STEP_RATE * times)
         height = np.where(turn % _GROUPS == group, bob, _AWAY)
         position = np.column_stack([x + distance * cosine, y + distance * sine, height])
-        # It faces the way it goes.
+        # It faces in its walking direction.
         return upright_poses(position, sense * cosine, sense * sine)
 
     return path

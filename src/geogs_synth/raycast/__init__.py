@@ -1,6 +1,6 @@
 """Ray casters.
 
-``solid_kernels`` meets single solids, compiled, and is used by all that runs on the CPU:
+``solid_kernels`` intersects rays with single solids, compiled, for both casters on the CPU:
 ``raycaster`` for a scene with hundreds of solids and moving bodies, ``cpu_caster`` for batches of
-rooms. ``cuda_caster`` does what the latter does, on a GPU; ``caster_choice`` takes one of the two.
+rooms. ``cuda_caster`` is the latter's version for a GPU; ``caster_choice`` takes one of the two.
 """

@@ -7,5 +7,5 @@ from geogs_synth.raycast.cuda_caster import CudaCaster
 
 
 def caster_for(device: torch.device) -> CpuCaster:
-    """Casts rays at rooms whose tensors are on the device."""
+    """Return the caster for rooms whose tensors are on the device."""
     return CudaCaster() if device.type == "cuda" else CpuCaster()

@@ -15,16 +15,16 @@ from geogs_synth.scene.solids import SolidBatch
 from geogs_synth.textures.pyramids import TextureBank
 
 SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
-"""Where in a pixel its four samples are: no two in a row or column."""
+"""Positions of a pixel's four samples in it: no two in a row or column."""
 _CHUNK = 2048
-"""Pixels at a time; what the rays need then stays in the processor's cache."""
+"""Pixels at a time; the data of the rays then stays in the processor's cache."""
 
 
 class CpuCaster:
     """Casts rays at batches of rooms, in the precision of the rooms and views."""
 
     def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:
-        """What every view sees."""
+        """Render every view."""
         b, v = views.T_cw.shape[:2]
         x, y = pixel_grid(views)
         seen = [
@@ -43,7 +43,7 @@ class CpuCaster:
     def flow(
         self, solids: SolidBatch, views: CameraBatch, points: Float[Tensor, "b h w 3"], view: int
     ) -> FlowTruth:
-        """Where points of the world are in a view."""
+        """Pixels and visibility of world points in a view."""
         shape = points.shape[:3]
         point = points.flatten(1, 2)
         pixels, valid = project(views, view, point)
@@ -59,7 +59,7 @@ class CpuCaster:
         self, size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
         direction: Float[Tensor, "b m 3"],
     ) -> Hit:  # fmt: skip
-        """The first thing that each ray from inside a room meets."""
+        """First hit of each ray from inside a room."""
         return closest_hit(size, solids, origin, direction)
 
 

@@ -23,7 +23,7 @@ class CudaCaster(CpuCaster):
     """Renders by the kernels of ``rooms.cu``."""
 
     def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:
-        """What every view sees."""
+        """Render every view."""
         b, v = views.T_cw.shape[:2]
         shape, device = (b, v, views.height, views.width), views.T_cw.device
         depth = torch.empty(shape, device=device)
@@ -41,7 +41,7 @@ class CudaCaster(CpuCaster):
     def flow(
         self, solids: SolidBatch, views: CameraBatch, points: Float[Tensor, "b h w 3"], view: int
     ) -> FlowTruth:
-        """Where points of the world are in a view."""
+        """Pixels and visibility of world points in a view."""
         b, height, width = points.shape[:3]
         pixels = torch.empty(b, height, width, 2, device=points.device)
         visible, valid = (torch.empty_like(pixels[..., 0], dtype=torch.bool) for _ in range(2))
@@ -56,7 +56,7 @@ class CudaCaster(CpuCaster):
         self, size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
         direction: Float[Tensor, "b m 3"],
     ) -> Hit:  # fmt: skip
-        """The first thing that each ray from inside a room meets."""
+        """First hit of each ray from inside a room."""
         b, rays = origin.shape[:2]
         t = torch.empty(b, rays, device=origin.device)
         solid = torch.empty(b, rays, dtype=torch.int32, device=origin.device)

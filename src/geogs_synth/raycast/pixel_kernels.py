@@ -14,7 +14,7 @@ from geogs_synth.scene.solids import BOX, FRUSTUM
 
 
 class PlacedSolids(NamedTuple):
-    """The scene's solids as one camera sees them."""
+    """The scene's solids in the frame of one camera."""
 
     kind: np.ndarray  # n
     half: np.ndarray  # n 3
@@ -37,7 +37,7 @@ class Textures(NamedTuple):
 
 
 class Lighting(NamedTuple):
-    """Lights and how much of each is seen from every cell of the room."""
+    """Lights, and the fraction of each that is visible from every cell of the room."""
 
     volume: np.ndarray  # nz ny nx 1+l: ambient, then each light, in [0, 1]
     voxel: float
@@ -104,7 +104,7 @@ def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
     fu, fv = u - c, v - r
     c0, r0 = int(c), int(r)
     c1, r1 = c0 + 1, r0 + 1
-    # Past the border follows the opposite border or the border itself.
+    # Beyond the border: the opposite border, or the border itself.
     c0 = (c0 if c0 >= 0 else (w - 1 if wrap else 0)) if c0 < w else w - 1
     r0 = (r0 if r0 >= 0 else (h - 1 if wrap else 0)) if r0 < h else h - 1
     c1 = c1 if c1 < w else (0 if wrap else w - 1)
@@ -204,7 +204,7 @@ def _surface(solids, camera, i, face, t, x, y, local, world, normal):
 
 @njit(**COMPILED)
 def _around(solid, face, row, column, found):
-    """Collects the distinct faces (8 solid + face) seen in 3 x 3 pixels; returns their number."""
+    """Collect the distinct faces (8 solid + face) seen in 3 x 3 pixels; return their number."""
     rows, columns = solid.shape
     count = 0
     for r in range(max(row - 1, 0), min(row + 2, rows)):
@@ -234,7 +234,7 @@ def shade_rows(
     solids, textures, lighting, camera, pixel, xs, ys, first, last, depth, solid, face,
     image, normals,
 ):  # fmt: skip
-    """Colour and camera-frame normal of rows [first, last) from what ``cast_rows`` found.
+    """Colour and camera-frame normal of rows [first, last) from the hits of ``cast_rows``.
 
     ``pixel`` is the width and height of a pixel on the plane z = 1.
 

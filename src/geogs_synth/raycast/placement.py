@@ -1,4 +1,4 @@
-"""Solids as cameras see them: in each camera's frame, and in which pixels."""
+"""Solids in each camera's frame, and the pixels that may see them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -54,7 +54,7 @@ class PlacedScene:
         near = z < _NEAR
         plane = local[..., :2] / np.where(near, 1.0, z)[..., None]
         box = lens.pixel_boxes(plane.min(2), plane.max(2), margin)
-        # A solid that crosses the camera's plane may be anywhere that no side of the view excludes.
+        # A solid that crosses the camera's plane may be in any pixel, unless a side excludes it.
         box[near.any(2)] = [0, 0, lens.camera.width, lens.camera.height]
         left, top, right, bottom = lens.view
         for beyond in (near, x < left * z, x > right * z, y < top * z, y > bottom * z):

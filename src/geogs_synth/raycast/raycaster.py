@@ -23,13 +23,13 @@ from geogs_synth.scene.textured_scene import Scene, Texture, joined
 _LEVELS = 8
 _VOXEL = 0.14
 _MAX_CELLS = 60_000
-"""Most cells of the volume that holds the light; larger scenes have larger ones."""
+"""Most cells of the light volume; larger scenes have larger cells."""
 _AMBIENT_REACH = 0.7
-"""Metres over which solids darken the ambient light, in cells of the smallest size."""
+"""Metres over which solids darken the ambient light where cells have the smallest size."""
 _SPHERE_SAMPLES = 24
 _SHADOW_MIN_HALF = 0.1
-"""Solids smaller than this in every direction cast no shadow, in cells of the smallest size; they
-cost as much as large ones."""
+"""Metres; solids smaller than this in every direction cast no shadow where cells have the smallest
+size, since they cost as much as large ones."""
 _ROWS_PLACED = 8
 """Rows of a rolling shutter between which solids move straight over the image."""
 _SKY_RADIUS = 1e5
@@ -38,7 +38,7 @@ _SKY_EMISSION = 0.95
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a camera sees, exact at the pixel centres."""
+    """A rendered image with its truth, exact at the pixel centres."""
 
     image: UInt8[np.ndarray, "h w 3"]
     """RGB, smoothed over the pixel."""
@@ -54,7 +54,7 @@ class RenderedView:
 
 @dataclass(frozen=True)
 class _Traced:
-    """What the kernels fill in."""
+    """Arrays that the kernels fill."""
 
     depth: Float64[np.ndarray, "h w"]
     solid: Int64[np.ndarray, "h w"]
@@ -79,7 +79,7 @@ class _Traced:
         return self.depth, self.solid, self.face
 
     def take(self, row: int, other: "_Traced", other_row: int) -> None:
-        """Copies a row of another."""
+        """Copy a row of another."""
         self.depth[row], self.solid[row] = other.depth[other_row], other.solid[other_row]
         self.image[row], self.normal[row] = other.image[other_row], other.normal[other_row]
 
@@ -87,7 +87,7 @@ class _Traced:
 class Raycaster:
     """Renders one scene from any number of cameras; textures and lighting are prepared once.
 
-    Bodies move through it; they are lit as everything else, but cast no shadow.
+    Moving bodies are lit as everything else, but cast no shadow.
     """
 
     def __init__(self, scene: Scene, threads: int = 2) -> None:
@@ -99,13 +99,13 @@ class Raycaster:
         self._use(())
 
     def with_bodies(self, bodies: Sequence[Body]) -> "Raycaster":
-        """The same scene with other bodies; what was prepared is shared."""
+        """The same scene with other bodies; the prepared data is shared."""
         other = copy.copy(self)
         other._use(bodies)
         return other
 
     def with_lights(self, changes: LightChanges) -> "Raycaster":
-        """The same scene whose lights change with the time; what was prepared is shared."""
+        """The same scene with lights that change over time; the prepared data is shared."""
         other = copy.copy(self)
         steady = self._lightings[0]
         other._lightings = tuple(
@@ -137,10 +137,10 @@ class Raycaster:
     def render(
         self, camera: Camera | RadialCamera, T_wc: Float64[np.ndarray, "4 4"], time: float = 0.0
     ) -> RenderedView:
-        """What a camera with pose camera-to-world ``T_wc`` sees, all rows at once.
+        """Render a camera with pose camera-to-world ``T_wc``, all rows at once.
 
         Depth, normal and solid are those of the ray through the pixel's centre; the colour is the
-        mean over the pixel. ``time`` in seconds places the bodies and tells the light.
+        mean over the pixel. ``time`` in seconds determines the bodies' poses and the light.
         """
         lens = RadialCamera.of(camera)
         placed = self._place(T_wc[None], np.array([time]))
@@ -167,7 +167,7 @@ class Raycaster:
         T_wc: Float64[np.ndarray, "h 4 4"],
         times: Float64[np.ndarray, "h"],
     ) -> RenderedView:
-        """What a camera sees whose row v is taken from the pose ``T_wc[v]`` at ``times[v]``.
+        """Render a camera whose row v is taken from the pose ``T_wc[v]`` at ``times[v]``.
 
         Row v is that of :meth:`render` at this pose and time.
         """
@@ -177,11 +177,11 @@ class Raycaster:
         def work(first: int, last: int) -> None:
             placed = self._place(T_wc[first:last], times[first:last])
             ends = placed.bounds(lens, np.array([0, last - first - 1]), margin=1.0)
-            # Over a few rows the corners of a solid move straight, between their ends.
+            # Over a few rows the corners of a solid move straight.
             bounds = np.concatenate([ends[..., :2].min(0), ends[..., 2:].max(0)], 1)
             for row in range(first, last):
                 low, high = max(row - 1, 0), min(row + 2, height)
-                # The rows above and below as this row's pose sees them tell where edges are.
+                # The rows above and below, seen from this row's pose, show where edges are.
                 around = _Traced.empty(high - low, width)
                 near = bounds - [0, low, 0, low]
                 rays = xs[low:high], ys[low:high]
@@ -215,7 +215,7 @@ class Raycaster:
     def _place(
         self, T_wc: Float64[np.ndarray, "p 4 4"], times: Float64[np.ndarray, "p"]
     ) -> PlacedScene:
-        """All solids as p cameras at p times see them."""
+        """Poses of all solids for p cameras at p times."""
         s = self._all
         rotation, centre = s.solids.rotation[None], s.solids.centre[None]
         if self._bodies:

@@ -1,7 +1,7 @@
 """Rays against batches of rooms on the CPU.
 
-A ray is ``origin + t * direction`` with any length of the direction. Solids are convex and only
-entered from outside, so each has at most one hit.
+A ray is ``origin + t * direction`` with any length of the direction. Solids are convex, and rays
+enter them only from outside, so each has at most one hit.
 """
 
 from dataclasses import dataclass
@@ -18,19 +18,19 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class Hit:
-    """Where rays meet a room or what stands in it."""
+    """Hits of rays with a room or a solid in it."""
 
     t: Float[Tensor, "b m"]
-    """In units of the direction."""
+    """Ray parameter, in units of the direction."""
     solid: Int[Tensor, "b m"]
-    """-1 where it is the room itself."""
+    """Index of the solid; -1 for the room itself."""
 
 
 def closest_hit(
     size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
     direction: Float[Tensor, "b m 3"],
 ) -> Hit:  # fmt: skip
-    """The first thing that each ray from inside a room meets."""
+    """First hit of each ray from inside a room."""
     d = torch.where(direction.abs() < _TINY, _TINY, direction)
     leaves = (torch.where(d > 0, size[:, None] - origin, -origin) / d).amin(-1)
     return _first(solids, origin, direction, leaves)
@@ -40,7 +40,7 @@ def occluded(
     solids: SolidBatch, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
     end: Float[Tensor, "b m"],
 ) -> Bool[Tensor, "b m"]:  # fmt: skip
-    """Whether a solid is met before ``t = end``."""
+    """Whether a solid is hit before ``t = end``."""
     return _first(solids, origin, direction, end).solid >= 0
 
 
@@ -48,7 +48,7 @@ def _first(
     solids: SolidBatch, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
     end: Float[Tensor, "b m"],
 ) -> Hit:  # fmt: skip
-    """The first solid before ``end``, or -1 there."""
+    """First hit with a solid before ``end``, or -1 there."""
     t, solid = end.double().clone(), torch.full(end.shape, -1)
     radius = solids.bounding_half.norm(dim=-1)
     numbers = (solids.half, solids.rotation, solids.centre, radius, origin, direction)

@@ -6,12 +6,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 MARGIN = 1.5e-3
-"""Metres before a point within which nothing hides it, since it lies on a solid itself."""
+"""Metres before a point in which hits are ignored, since the point lies on a solid itself."""
 
 
 @dataclass(frozen=True)
 class RenderedRooms:
-    """What views see."""
+    """Rendered views of rooms."""
 
     colour: Float[Tensor, "b v 3 h w"]
     """Linear, the mean of four samples per pixel."""
@@ -20,12 +20,12 @@ class RenderedRooms:
     normal: Float[Tensor, "b v 3 h w"]
     """Unit, camera frame, facing the camera, of the surface that this ray meets."""
     solid: Int[Tensor, "b v h w"]
-    """Place of the solid that it meets; -1 for the room itself."""
+    """Index of the solid that this ray meets; -1 for the room itself."""
 
 
 @dataclass(frozen=True)
 class FlowTruth:
-    """Where points are in a view."""
+    """Pixels of points in a view, and their visibility."""
 
     pixels: Float[Tensor, "b h w 2"]
     """x, y."""

@@ -12,9 +12,9 @@ from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
 from geogs_synth.textures.pyramids import TextureBank
 
 CORNERS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
-"""A light is four points, one for each sample of a pixel: corners of a tetrahedron."""
+"""Four points of a light, one for each sample of a pixel: corners of a tetrahedron."""
 CREASES = ((0.08, 0.35), (0.35, 0.45))
-"""Height in metres above the surface where things in the way darken it, and how much."""
+"""Heights in metres above a surface at which occluders darken it, and by how much."""
 LIFT = 1e-3
 """Metres by which shadow rays start above their surface."""
 SOFTENING = 0.3
@@ -45,10 +45,10 @@ def shade(
     footprint: Float[Tensor, "b m"],
     access: Float[Tensor, "b m"],
 ) -> Float[Tensor, "b m 3"]:
-    """Linear colour of points that one of the four samples of a view's pixels sees.
+    """Linear colour of the points that one of the four samples of a view's pixels sees.
 
     ``direction`` is the ray's, ``footprint`` the width of a sample at the point in metres, across
-    the ray, ``access`` what :func:`ambient_access` gives.
+    the ray, ``access`` the result of :func:`ambient_access`.
     """
     surface = gather(rooms.surfaces, point.surface)
     towards = -torch.nn.functional.normalize(direction, dim=-1)
@@ -90,7 +90,7 @@ def _reflected(
     sample: int,
     footprint: Float[Tensor, "b m"],
 ) -> Float[Tensor, "b m 3"]:
-    """What mirroring points reflect towards unit directions; light there is without shadows."""
+    """Light that mirroring points reflect along unit directions; it is without shadows."""
     hit = closest_hit(rooms.size, rooms.solids, start, direction)
     point = surface_point(rooms, hit, start, direction)
     surface = gather(rooms.surfaces, point.surface)
@@ -117,7 +117,7 @@ def _ambient(
 def _lamp(
     ray: Float[Tensor, "b m 3"], point: SurfacePoint, colour: Float[Tensor, "b 3"]
 ) -> Float[Tensor, "b m 3"]:
-    """Irradiance from a light at the end of the rays, if nothing is in the way."""
+    """Unoccluded irradiance from a light at the end of the rays."""
     squared = (ray * ray).sum(-1)
     facing = ((ray * point.normal).sum(-1) / squared.sqrt()).clamp_min(0)
     return colour[:, None] * (facing / (squared + SOFTENING))[..., None]
@@ -143,6 +143,6 @@ def _albedo(
 
 
 def _level(bank: TextureBank, repeats: Float[Tensor, "b m"], sample: int) -> Int[Tensor, "b m"]:
-    """Level whose texels are as wide as the sample; the four samples round differently."""
+    """Pyramid level with texels as wide as the sample; the four samples round differently."""
     level = (repeats * bank.size).clamp_min(1e-6).log2() + (sample + 0.5) / 4
     return level.floor().clamp(0, bank.levels - 1).long()

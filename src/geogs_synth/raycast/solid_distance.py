@@ -10,7 +10,7 @@ from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch
 
 
 def signed_distance(solids: SolidBatch, points: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m n"]:
-    """Distance in metres from points to solids, negative inside; infinite for empty places.
+    """Distance in metres from points to solids, negative inside; infinite for empty slots.
 
     Exact outside boxes, close to it near the others.
     """
@@ -35,7 +35,7 @@ def wall_distance(
 
 
 def _places(solids: SolidBatch, kind: int) -> Int[Tensor, "k"]:
-    """The places where some room has a solid of a kind; all of them on a GPU."""
+    """Slots in which some room has a solid of a kind; all slots on a GPU."""
     n, device = solids.kind.shape[1], solids.kind.device
     if device.type != "cpu":  # to know how many there are, the host would have to wait
         return torch.arange(n, device=device)

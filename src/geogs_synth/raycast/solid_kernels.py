@@ -119,8 +119,8 @@ def outward_normal(kind, half, face, px, py, pz):
 def crossing(kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, reach, from_outside):
     """Distance and face at which the ray from p along the unit d first crosses a solid; inf if not.
 
-    It may be inf, too, where it is more than ``reach``. ``radius`` is that of the ball around the
-    solid. With ``from_outside`` a solid is not met by rays that start in it.
+    Distances beyond ``reach`` may be inf, too. ``radius`` is that of the ball around the solid.
+    With ``from_outside`` rays that start in a solid do not hit it.
     """
     x, y, z = px - centre[0], py - centre[1], pz - centre[2]
     # Most solids are ruled out by their bounding sphere's distance from the segment.
@@ -154,9 +154,9 @@ def _inside(kind, half, x, y, z):
 
 @njit(**COMPILED)
 def closest_hits(kind, half, rotation, centre, radius, origin, direction, t, solid):
-    """The solid that each ray meets first before ``t``, which becomes where; others stay as is.
+    """Find the first solid that each ray hits before ``t``; update ``t`` and ``solid`` there.
 
-    Solids are only met from outside; those of a negative kind not at all.
+    Solids are only hit from outside; those of a negative kind not at all.
     """
     for ray in range(len(t)):
         p, d = origin[ray], direction[ray]

@@ -6,15 +6,15 @@ from numba import njit
 from geogs_synth.raycast.solid_kernels import COMPILED, crossing
 
 _ROUNDING = 1e-6
-"""Metres by which bounding balls are taken for larger."""
+"""Metres by which bounding balls are enlarged."""
 
 
 @njit(**COMPILED)
 def _near_segment(centre, radius, px, py, pz, dx, dy, dz, margin, near):
-    """Solids whose bounding ball comes within ``margin`` of the segment from p to p + d.
+    """Find the solids whose bounding ball comes within ``margin`` of the segment from p to p + d.
 
-    Their numbers go to ``near``; returns how many there are. No ray that stays within the margin
-    meets another.
+    Their indices go to ``near``; returns their number. No ray that stays within the margin hits
+    another.
     """
     count, square = 0, dx * dx + dy * dy + dz * dz
     for i in range(len(radius)):

@@ -1,2 +1,2 @@
-"""What synthetic scenes are made of: ``solids`` for all; a ``scene`` for sequences, ``rooms`` for
-training add what they look like and the light."""
+"""Parts of synthetic scenes: ``solids`` for all; ``textured_scene`` for sequences and ``rooms`` for
+training add their appearance and the light."""

@@ -14,7 +14,7 @@ Part = TypeVar("Part")
 
 
 def map_tensors(change: Callable[..., Tensor], first: Part, *others: Part) -> Part:
-    """Applies ``change`` to the tensors of one part, or to those that correspond in several."""
+    """Apply ``change`` to the tensors of one part, or to corresponding tensors of several."""
     values: list[Any] = []
     for field in fields(first):  # type: ignore[arg-type]
         own = [getattr(part, field.name) for part in (first, *others)]
@@ -26,7 +26,7 @@ def map_tensors(change: Callable[..., Tensor], first: Part, *others: Part) -> Pa
 
 
 def on_device(part: Part, device: torch.device) -> Part:
-    """The same on a device, without waiting for it."""
+    """Copy to a device, without waiting for it."""
     return map_tensors(lambda t: to_device(t.contiguous(), device), part)
 
 
@@ -36,7 +36,7 @@ def one_scene(part: Part, scene: int) -> Part:
 
 
 def where(which: Bool[Tensor, "*b"], first: Part, second: Part) -> Part:
-    """The first where ``which``, else the second."""
+    """Return the first where ``which``, else the second."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(which.reshape(*which.shape, *[1] * (a.ndim - which.ndim)), a, b)
@@ -45,11 +45,11 @@ def where(which: Bool[Tensor, "*b"], first: Part, second: Part) -> Part:
 
 
 def gather(part: Part, index: Int[Tensor, "b m"]) -> Part:
-    """Some of what each scene has along the second axis."""
+    """Take some entries of each scene along the second axis."""
     rows = torch.arange(len(index), device=index.device)[:, None]
     return map_tensors(lambda t: t[rows, index], part)
 
 
 def concatenate(first: Part, *others: Part) -> Part:
-    """What each scene has along the second axis, one after the other."""
+    """Concatenate the entries of each scene along the second axis."""
     return map_tensors(lambda *tensors: torch.cat(tensors, 1), first, *others)

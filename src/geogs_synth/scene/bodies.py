@@ -1,4 +1,4 @@
-"""Rigid things that move through a scene."""
+"""Rigid bodies that move through a scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -28,7 +28,7 @@ def yaw_rotation(yaw: Number) -> Float64[np.ndarray, "3 3"]:
 
 
 class _Solid(NamedTuple):
-    """A row of the arrays of a scene."""
+    """One entry of the arrays of a scene."""
 
     kind: int
     rotation: np.ndarray
@@ -54,14 +54,14 @@ class SceneBuilder:
         self._origin = np.zeros(3)
 
     def at(self, x: Number, y: Number, z: Number = 0.0, yaw: Number = 0.0) -> "SceneBuilder":
-        """A builder for a frame placed in this one; what it adds lands in the same scene."""
+        """A builder for a frame inside this one; its solids are added to the same scene."""
         child = copy.copy(self)
         child._rotation = self._rotation @ yaw_rotation(yaw)
         child._origin = self._origin + self._rotation @ np.array([x, y, z])
         return child
 
     def texture(self, image: UInt8[np.ndarray, "h w 3"], metres_per_texel: float = 0.0) -> int:
-        """Registers a texture and returns its index; without a scale it is stretched over faces."""
+        """Register a texture and return its index; without a scale it is stretched over faces."""
         self._textures.append(Texture(image, metres_per_texel))
         return len(self._textures) - 1
 

@@ -1,6 +1,6 @@
-"""Names of what lamps do while a sequence is taken."""
+"""Names of the behaviours of lamps during a sequence."""
 
 from typing import Literal
 
 LampKind = Literal["steady", "switched"]
-"""As they are all the time, or others in each third of the sequence."""
+"""Constant lamps, or other lamps in each third of the sequence."""

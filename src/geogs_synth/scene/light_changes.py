@@ -1,4 +1,4 @@
-"""Lamps of a scene that are switched while a sequence is taken."""
+"""Lamps of a scene that are switched during a sequence."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 _OFF, _BRIGHT = 0.0, 2.0
-"""Gains of a lamp that is off, and of one that is turned up in its place."""
+"""Gains of a lamp that is off, and of one that is brighter instead."""
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class LightChanges:
 
 
 def switched_by_thirds(lights: int, seconds: float) -> LightChanges:
-    """All lights as they are at first; then every other one is off, and the rest bright; then
-    the other way round."""
+    """Three lightings: all lights as they are; every other one off and the rest bright; and the
+    reverse."""
     is_even = np.arange(lights) % 2 == 0
     first = np.where(is_even, _OFF, _BRIGHT)
     second = np.where(is_even, _BRIGHT, _OFF)

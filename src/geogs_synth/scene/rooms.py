@@ -1,4 +1,4 @@
-"""Batches of random rooms, as training sees them: solids, surfaces, lights.
+"""Batches of random rooms for training: solids, surfaces, lights.
 
 A room fills [0, size]. Surfaces: 0..5 are the room's faces -x, +x, -y, +y, -z (floor), +z
 (ceiling); solid i has surface 6 + 2 i around it and 7 + 2 i on its two faces along the local z axis
@@ -15,12 +15,12 @@ from geogs_synth.scene.batch import gather, map_tensors
 from geogs_synth.scene.solids import NONE, SolidBatch
 
 MOST_SOLIDS = 128
-"""Most places for solids in a room that the kernels take."""
+"""Most solids in a room that the kernels take."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """How the s surfaces of b rooms look.
+    """Appearance of the s surfaces of b rooms.
 
     The colour at a point with metric surface coordinates u is, in display values, ``tint *
     (0.5 + contrast * (texture(matrix u + offset) - 0.5)) * (1 + 2 detail * (noise - 0.5))``, where
@@ -30,7 +30,7 @@ class Surfaces:
     texture: Int[Tensor, "b s"]
     """Index into the bank."""
     matrix: Float[Tensor, "b s 2 2"]
-    """Repeats of the texture per metre; turned or mirrored, but scaled evenly."""
+    """Repeats of the texture per metre; rotated or mirrored, but scaled evenly."""
     offset: Float[Tensor, "b s 2"]
     """Repeats."""
     contrast: Float[Tensor, "b s"]
@@ -53,7 +53,7 @@ class Surfaces:
     """Reflects the room: 0 for most, near 1 for a mirror; more at grazing angles."""
 
     def packed(self) -> Float[Tensor, "b s 20"]:
-        """What the kernels read, in their order."""
+        """Kernel input, in the kernels' order."""
         columns = [
             self.texture[..., None], self.matrix.flatten(-2), self.offset, self.contrast[..., None],
             self.tint, torch.stack([self.noise.float(), self.noise_scale, self.detail, self.gloss,
@@ -65,7 +65,7 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class Lights:
-    """Light of each of v views: l balls and what comes from everywhere."""
+    """Light of each of v views: l balls and ambient light."""
 
     position: Float[Tensor, "b v l 3"]
     """World, metres."""
@@ -79,7 +79,7 @@ class Lights:
     """Ambient irradiance of surfaces facing down."""
 
     def packed(self) -> Float[Tensor, "b v n"]:
-        """What the kernels read: ambient above and below, then 8 numbers for each light."""
+        """Kernel input: ambient light from above and below, then 8 numbers for each light."""
         zero = torch.zeros_like(self.radius)
         balls = torch.cat([self.position, self.colour, torch.stack([self.radius, zero], -1)], -1)
         ambient = torch.cat([self.above, self.below], -1)
@@ -98,7 +98,7 @@ class Rooms:
     lights: Lights
 
     def with_places(self, most: int) -> "Rooms":
-        """With at most so many places for solids: empty ones are removed first, then the last."""
+        """Keep at most ``most`` slots for solids: empty ones are removed first, then the last."""
         kind = self.solids.kind
         if kind.shape[1] <= most:
             return self
@@ -110,14 +110,14 @@ class Rooms:
 
 
 def packed_solids(solids: SolidBatch) -> Float[Tensor, "b n 16"]:
-    """What the kernels read: world-to-local rotation by rows, centre, half, kind."""
+    """Kernel input: world-to-local rotation by rows, centre, half, kind."""
     rotation = solids.rotation.transpose(-1, -2).flatten(-2)
     rows = [rotation, solids.centre, solids.half, solids.kind[..., None]]
     return torch.cat([r.float() for r in rows], -1).contiguous()
 
 
 def room_per_view(rooms: Rooms, views: int, velocity: Float[Tensor, "b n 3"]) -> Rooms:
-    """A room for each view, with what moves by ``velocity`` (metres per view) where it is then."""
+    """A room for each view, with solids moved by ``velocity`` (metres per view) up to it."""
 
     def repeat(tensor: Tensor) -> Tensor:
         return tensor.repeat_interleave(views, 0)

@@ -1,4 +1,4 @@
-"""Boxes, cone frustums and ellipsoids: what every synthetic scene is made of.
+"""Boxes, cone frustums and ellipsoids: the solids of every synthetic scene.
 
 World frame: z up, metres, a scene fills [0, size]. A solid has a local frame (rotation local to
 world, centre) and three numbers ``half`` whose meaning depends on its kind:
@@ -24,10 +24,10 @@ Array = TypeVar("Array", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Solids(Generic[Array]):
-    """Solids in NumPy or PyTorch: n of a scene, or n places for them in each of b scenes."""
+    """Solids in NumPy or PyTorch: n of a scene, or n slots for them in each of b scenes."""
 
     kind: Array
-    """(n) or (b n): BOX, FRUSTUM, ELLIPSOID, or NONE where a place is empty."""
+    """(n) or (b n): BOX, FRUSTUM, ELLIPSOID, or NONE where a slot is empty."""
     rotation: Array
     """(n 3 3) or (b n 3 3): local to world."""
     centre: Array
@@ -44,18 +44,18 @@ class Solids(Generic[Array]):
         return xp.where((self.kind == FRUSTUM)[..., None], frustum, self.half)  # type: ignore[no-any-return]
 
     def at(self, places: Any) -> "Solids[Array]":
-        """Some of the solids, of every scene; by an index, a mask or a slice."""
+        """Some of the solids of every scene, by an index, a mask or a slice."""
         own = (slice(None),) * (self.kind.ndim - 1) + (places,)
         return Solids(*(getattr(self, f.name)[own] for f in fields(Solids)))
 
     def without(self: "Solids[Tensor]", gone: Bool[Tensor, "b n"]) -> "Solids[Tensor]":
-        """The same places, some emptied."""
+        """The same slots, some emptied."""
         return replace(self, kind=torch.where(gone, NONE, self.kind))
 
     def moved_by(
         self: "Solids[Tensor]", velocity: Float[Tensor, "b n 3"], views: int | Int[Tensor, "*m"]
     ) -> "Solids[Tensor]":
-        """The same that many views later, of what moves by ``velocity`` from view to view."""
+        """The solids ``views`` views later, moved by ``velocity`` from view to view."""
         return replace(self, centre=self.centre + views * velocity)
 
     def flatten(self: "Solids[Tensor]") -> "Solids[Tensor]":
@@ -77,5 +77,5 @@ SolidBatch = Solids[Tensor]
 def upright(
     kind: Int[Tensor, "*n"], centre: Float[Tensor, "*n 3"], half: Float[Tensor, "*n 3"]
 ) -> SolidBatch:
-    """Solids that are not turned."""
+    """Solids without rotation."""
     return Solids(kind, torch.eye(3).expand(*kind.shape, 3, 3), centre, half)

@@ -1,4 +1,4 @@
-"""A room or a street as a sequence shows it: textured solids, lights, a sky.
+"""A room or a street of a sequence: textured solids, lights, a sky.
 
 Faces are numbered 0..5 for -x, +x, -y, +y, -z, +z of a solid's local frame; the round side of a
 frustum and the whole ellipsoid are face 0.
@@ -23,7 +23,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Light:
-    """A small ball that gives light and is itself not seen."""
+    """A small ball that gives light and is itself invisible."""
 
     position: tuple[float, float, float]
     colour: tuple[float, float, float]
@@ -43,11 +43,11 @@ class Scene:
     texture_shift: Float64[np.ndarray, "n 2"]
     """Metres by which repeating textures are shifted, so that no two solids look the same."""
     emission: Float64[np.ndarray, "n"]
-    """Positive: the surface glows with this gain in any light, and casts no shadow."""
+    """Gain with which a surface glows in any light, if positive; it then casts no shadow."""
     textures: tuple[Texture, ...]
     lights: tuple[Light, ...]
     sky: Texture | None = None
-    """Longitude and latitude of what is infinitely far; none in a closed room."""
+    """Texture of the infinitely far sky by longitude and latitude; none in a closed room."""
 
     def __len__(self) -> int:
         return len(self.emission)

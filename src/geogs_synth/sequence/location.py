@@ -1,4 +1,4 @@
-"""Where a sequence is taken: the scene, the camera's shape and the units that suit its size."""
+"""Location of a sequence: the scene, the camera's intrinsics and units that suit its size."""
 
 import math
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from geogs_synth.scene.textured_scene import Scene
 ROOM_FOCAL = 0.7
 """Focal length over the longer side of the image in rooms: 71 degrees across."""
 STREET_FOCAL = 0.58
-"""82 degrees across."""
+"""The same on streets: 82 degrees across."""
 
 _MAX_SIZE = 8192
 
 
 @dataclass(frozen=True)
 class Location:
-    """A scene and a way through it."""
+    """A scene and a camera motion through it."""
 
     kind: MotionKind
     name: str
@@ -35,22 +35,22 @@ class Location:
     motion: Motion
     width: int
     height: int
-    """Pixels of the images, where the user does not say."""
+    """Default height of the images, pixels."""
     focal: float
     """Focal length over the longer side of the image: a phone held upright has the same lens."""
     depth_scale: float
     """Units of the depth images per metre."""
     voxel_cm: int
-    """Side of the cells of which each that was seen gives a point, centimetres."""
+    """Voxel size of the seen points, one point to a voxel, centimetres."""
     reach: float
-    """Metres of depth beyond which nothing counts as seen."""
+    """Largest depth that counts as seen, metres."""
 
     def camera(self, width: int | None, height: int | None) -> Camera:
-        """The camera of the size asked for, its principal point in the middle of the image."""
+        """A camera of this or the default size, its principal point in the middle of the image."""
         return centred_camera(width or self.width, height or self.height, self.focal)
 
     def bodies(self, camera: Camera, seconds: float, coverage: float) -> list[Body]:
-        """What moves in the camera's view and covers about this fraction of it."""
+        """Moving bodies that cover about the fraction ``coverage`` of the camera's view."""
         if self.kind == "driving":
             return street_traffic(camera, coverage, self.seed)
         return crossing_walkers(self.motion.path, seconds, camera, coverage, self.seed)
@@ -59,7 +59,7 @@ class Location:
 def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> Location:
     """The room, dining room, street or corridor of the seed, and the motion through it.
 
-    ``scene``, if it is there already, is not made again.
+    ``scene``, if given, is not made again.
     """
     scene = scene or make_scene(kind, seed)
     if kind == "driving":

@@ -36,7 +36,7 @@ _DEPTH_UNITS = 65535
 # Level 1 is four times faster than the default and a few percent larger.
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _ENCODING = {"crf": "16", "x264-params": "mbtree=0"}
-"""High quality, and the same for the same images: x264's macroblock tree differs each time."""
+"""High quality, and reproducible: x264's macroblock tree would differ each time."""
 
 
 def write_sequence(
@@ -58,23 +58,23 @@ def write_sequence(
     raycaster: Raycaster | None = None,
     on_frame: Callable[[int], None] = lambda index: None,
 ) -> None:
-    """Renders a scene and writes images, depths, poses, intrinsics and the true surface.
+    """Render a scene and write images, depths, poses, intrinsics and the true surface.
 
-    ``results/frame%06d.jpg`` (or png), ``results/depth%06d.png`` (z; how many units to the metre
-    stands in the intrinsics), ``traj.txt`` (camera to world, one row-major 4x4 a line),
-    ``cam_params.json``, ``mesh.ply`` (the whole scene), ``points_seen_1cm.ply`` (what the camera
-    saw), and ``video.mp4`` if asked for. Where the motion has not 30 frames a second, ``rgb.txt``
-    and ``groundtruth.txt`` hold the times, in the layout of TUM. Depth and poses are those of the
+    Files: ``results/frame%06d.jpg`` (or png), ``results/depth%06d.png`` (z; the intrinsics hold the
+    units per metre), ``traj.txt`` (camera to world, one row-major 4x4 a line), ``cam_params.json``,
+    ``mesh.ply`` (the whole scene), ``points_seen_1cm.ply`` (the surface that the camera saw), and
+    ``video.mp4`` if ``video`` is set. Where the motion has not 30 frames a second, ``rgb.txt`` and
+    ``groundtruth.txt`` hold the times, in the layout of TUM. Depth and poses are those of the
     middle row at mid-exposure, whatever the flaws; a ``depth_sensor`` adds its own. With
-    ``moving``, things that cover about this fraction of the image cross the view: they are in the
+    ``moving``, bodies that cover about this fraction of the image cross the view: they are in the
     images and the depths, but in neither the mesh nor the points, and ``results/moving%06d.png`` is
     white where the depth is theirs. Where the ``lamps`` are switched, each third of the sequence
     shows the scene in another light.
-    ``raycaster`` of the same scene, where there is one, saves its making. ``on_frame`` is called
+    A given ``raycaster`` of the same scene is used instead of a new one. ``on_frame`` is called
     after each frame.
 
     Raises:
-        InputError: what is asked for cannot be rendered.
+        InputError: the options cannot be rendered.
         OutputError: the folder cannot be written.
     """
     if image_format not in ("jpg", "png"):
@@ -139,7 +139,7 @@ def _write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
 
 
 def _encode(path: Path, camera: Camera, rate: float, shots: Iterator[Shot]) -> Iterator[Shot]:
-    """Passes the shots through and writes them as H.264 video."""
+    """Pass the shots through and write them as H.264 video."""
     import av
 
     with av.open(str(path), "w") as container:
@@ -163,7 +163,7 @@ def _write_camera(
     moving: float,
     lamps: LampKind,
 ) -> None:
-    """Writes the intrinsics, with the distortion, for programs; the rest is for evaluation."""
+    """Write the intrinsics, with the distortion, for programs; the rest is for evaluation."""
     c = lens.camera
     intrinsics: dict[str, Any] = {
         "w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
@@ -185,12 +185,12 @@ def _write_camera(
 
 
 def _write_trajectory(folder: Path, motion: Motion, frames: int, image_format: str) -> None:
-    """Writes ``traj.txt``; where that does not tell the times, lists of TUM besides."""
+    """Write ``traj.txt`` and, where the frame rate is not the usual one, lists of TUM."""
     times = np.arange(frames) / motion.rate
     T_wc = motion.path(times)
     with atomic_file(folder / "traj.txt") as stream:
         np.savetxt(stream, T_wc.reshape(-1, 16), fmt="%.9f")
-    # A list of an earlier sequence in this folder would be believed.
+    # A list of an earlier sequence in this folder would be used.
     if motion.rate != FRAMES_PER_SECOND or (folder / "rgb.txt").exists():
         names = (f"results/frame{index:06d}.{image_format}" for index in range(frames))
         lines = (f"{time:.6f} {name}\n" for time, name in zip(times, names, strict=True))

@@ -1,4 +1,4 @@
-"""The surface of a scene as triangles and as the points a camera has seen."""
+"""The surface of a scene as triangles and as the points that a camera has seen."""
 
 import math
 
@@ -81,7 +81,7 @@ def _ellipsoid(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class SeenSurface:
-    """The surface points that depth maps of one camera have shown, one to a voxel."""
+    """The surface points in the depth maps of one camera, one to a voxel."""
 
     def __init__(self, scene: Scene, camera: Camera | RadialCamera, voxel: float = 0.01) -> None:
         x, y = RadialCamera.of(camera).rays
@@ -93,7 +93,7 @@ class SeenSurface:
         self._points: list[Float32[np.ndarray, "k 3"]] = []
 
     def add(self, depth: Float32[np.ndarray, "h w"], T_wc: Float64[np.ndarray, "4 4"]) -> None:
-        """Adds the back-projected pixels that fall into voxels of the scene empty so far."""
+        """Add the back-projected pixels that fall into voxels of the scene empty so far."""
         seen = depth > 0
         points = (depth[..., None] * self._rays)[seen] @ T_wc[:3, :3].T + T_wc[:3, 3]
         cell = (points / self._voxel).astype(np.int32) + 1

@@ -14,10 +14,10 @@ from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.bodies import Body, Path
 
 _SHARP = 0.5
-"""Pixels over which an image may move while it is taken and is still taken as sharp."""
+"""Largest motion of an image during its exposure that counts as sharp, pixels."""
 _MIN_SAMPLES, _MAX_SAMPLES = 5, 24
 _GRID = 16
-"""Points across the image whose motion is looked at."""
+"""Points across the image whose motion is measured."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Shot:
     image: UInt8[np.ndarray, "h w 3"]
     """RGB, with all flaws."""
     truth: RenderedView
-    """What a camera of the same lens without a shutter sees from ``T_wc``."""
+    """Render of the same lens, without a shutter, from ``T_wc``."""
     moving: np.ndarray
-    """h w, bool: where ``truth`` shows a body."""
+    """h w, bool: mask of the bodies in ``truth``."""
 
 
 class Shooting:
-    """A camera with flaws on its way through a scene.
+    """A camera with flaws that moves through a scene.
 
     Row v of h is taken at (v / (h - 1) - 1/2) readout from the time of its frame.
     """
@@ -51,7 +51,7 @@ class Shooting:
         rate: float = 30.0,
         seed: int = 0,
     ) -> None:
-        """``rate`` in frames per second; the bodies that move are those of the raycaster."""
+        """``rate`` in frames per second; the moving bodies are those of the raycaster."""
         self.lens = lens
         self._raycaster = raycaster
         self._path = path
@@ -85,7 +85,7 @@ class Shooting:
         return time + exposure * ((np.arange(count) + 0.5) / count - 0.5)
 
     def row_times(self) -> Float64[np.ndarray, "h"]:
-        """Seconds of every row from the time of its frame."""
+        """Time of every row relative to its frame, seconds."""
         rows = self.lens.camera.height
         return (np.arange(rows) / (rows - 1) - 0.5) * self._flaws.readout
 
@@ -111,7 +111,7 @@ class Shooting:
     def _image_motion(
         self, truth: RenderedView, T_wc: np.ndarray, time: float, ends: np.ndarray
     ) -> float:
-        """Pixels by which the image moves most between two times."""
+        """Largest motion in the image between two times, pixels."""
         step = max(1, self.lens.camera.width // _GRID)
         some = slice(step // 2, None, step)
         x, y = (axis[some, some].ravel() for axis in self.lens.rays)
@@ -134,7 +134,7 @@ class Shooting:
 def _moved_along(
     body: Body, world: np.ndarray, time: float, ends: np.ndarray
 ) -> Float64[np.ndarray, "e n 3"]:
-    """Where points on a body at ``time`` are at other times."""
+    """Positions at other times of points on a body at ``time``."""
     T_bw = np.linalg.inv(body.path(np.array([time]))[0])
     T_wb = body.path(ends)
     local = world @ T_bw[:3, :3].T + T_bw[:3, 3]

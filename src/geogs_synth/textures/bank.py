@@ -27,7 +27,7 @@ VALIDATION_PHOTOGRAPHS = ("chelsea.png", "gravel.png", "moon.png", "text.png", "
 _MATERIALS = 0.6
 """Fraction of the bank that is materials rather than images."""
 _LEAST_DRAWN = 192
-"""Texels; the drawn textures need some room and are reduced where less is asked for."""
+"""Least side of a drawn texture, texels; smaller ones are reduced from it."""
 
 
 def make_bank(
@@ -50,7 +50,7 @@ def make_bank(
 
 
 def _periodic(recipe: Recipe, rng: np.random.Generator, size: int) -> UInt8[np.ndarray, "s s 3"]:
-    """An image whose opposite borders fit, by fading what lies beyond one into the other."""
+    """An image whose opposite borders fit, by fading the part beyond one into the other."""
     drawn = max(size, _LEAST_DRAWN)
     margin = drawn // 8
     image = recipe(rng, drawn + margin).astype(np.float32)
@@ -80,7 +80,7 @@ def _material(rng: np.random.Generator) -> Recipe:
 
 
 def _image(rng: np.random.Generator, index: int, validation: bool) -> Recipe:
-    """Every second a photograph, the others drawn."""
+    """A photograph for every second image, a drawing for the others."""
     if index % 2 == 0:
         names = VALIDATION_PHOTOGRAPHS if validation else TRAINING_PHOTOGRAPHS
         name = names[index // 2 % len(names)]
@@ -157,6 +157,6 @@ def _crop(rng: np.random.Generator, name: str, size: int) -> UInt8[np.ndarray, "
 
 @cache
 def _photograph(name: str) -> UInt8[np.ndarray, "h w 3"] | None:
-    """One of the pictures that come with scikit-image; None where it was left out."""
+    """A picture that comes with scikit-image; None where it was left out."""
     path = Path(skimage.__file__).parent / "data" / name
     return np.asarray(Image.open(path).convert("RGB")) if path.is_file() else None

@@ -8,7 +8,7 @@ from geogs_synth.textures import patterns
 from geogs_synth.textures.patterns import Colour, finish, fractal_noise
 
 FACADE_TEXEL, ROAD_TEXEL = 0.022, 0.0125
-"""Metres."""
+"""Metres per texel."""
 
 
 def facade(rng: np.random.Generator, width: float, height: float) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,7 +1,7 @@
 """Procedural surface textures, drawn from a random generator; nothing is downloaded.
 
-Every function returns an RGB image of the asked shape whose detail spans many scales, since what
-tracks the camera is optical flow. Textures that repeat (wood, fabric, carpet) are periodic.
+Every function returns an RGB image of the given shape whose detail spans many scales, since the
+camera is tracked by optical flow. Textures that repeat (wood, fabric, carpet) are periodic.
 """
 
 import colorsys
@@ -82,7 +82,7 @@ def plaster(
     trowel = fractal_noise(rng, shape, (shape[0] / 12, shape[1] / 48), 2)
     speckle = fractal_noise(rng, shape, (shape[0] / 5, shape[1] / 5), 2)
     image = _tint(stains, colour, 0.07) * (1 + 0.025 * trowel + 0.03 * speckle)[..., None]
-    # Where the paint has worn off, the coarser ground shows.
+    # The coarser ground shows where the paint has worn off.
     worn = np.clip(fractal_noise(rng, shape, (4, 6), 6, 0.7) * 3 - 5, 0, 1)[..., None]
     image = image * (1 - worn) + worn * _tint(speckle, (150, 138, 122), 0.12)
     for _ in range(6):
@@ -218,7 +218,7 @@ def panels(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Smooth painted panels of ``cell`` texels down and across.
 
-    The narrow joints between them are darker by ``contrast``, a part of the colour.
+    The narrow joints between them are darker by the fraction ``contrast`` of the colour.
     """
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     row, column = (y / cell[0]).astype(int), (x / cell[1]).astype(int)

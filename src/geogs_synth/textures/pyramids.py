@@ -1,4 +1,4 @@
-"""The bank of textures as the renderer reads it: square images with all their smaller levels."""
+"""The renderer's bank of textures: square images with all their smaller levels."""
 
 from dataclasses import dataclass
 
@@ -16,11 +16,11 @@ class TextureBank:
     size: int
     """Side of the finest level."""
     materials: int
-    """The first so many are materials (wood, plaster, noise), the others images."""
+    """Number of materials (wood, plaster, noise), which come first; the others are images."""
 
     @property
     def levels(self) -> int:
-        """Including the last of one texel."""
+        """Number of levels, with the last of one texel."""
         return self.size.bit_length()
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Clips of random rooms that stay on the device: more keyframes a second than can be rendered."""
+"""Pool of clips of random rooms on the device: more keyframes a second than can be rendered."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from geogs_train.ahead import PlansAhead
 from geogs_train.course import Worker
 
 QUANTILES = (0.05, 0.5, 0.95)
-"""Quantiles of depth, which stand for what a tracker knows of a view."""
+"""Quantiles of depth, used as a tracker's knowledge of a view."""
 
 
 @dataclass(frozen=True)
 class StoredClips:
-    """n clips of v views as they are kept."""
+    """n stored clips of v views."""
 
     images: UInt8[Tensor, "n v 3 h w"]
     depth: Float[Tensor, "n v h w"]
@@ -31,7 +31,7 @@ class StoredClips:
 
     @staticmethod
     def of(clips: ClipBatch) -> "StoredClips":
-        """A batch of clips."""
+        """Convert a batch of clips."""
         coarse = clips.depth[..., ::4, ::4].flatten(2)
         levels = torch.tensor(QUANTILES, device=coarse.device)
         return StoredClips(
@@ -44,22 +44,22 @@ class StoredClips:
         )
 
     def tensors(self) -> list[Tensor]:
-        """In the order of the fields."""
+        """Tensors in the order of the fields."""
         return [*vars(self).values()]
 
 
 class ClipPool:
-    """At turn t it holds the batches t to t + ``plans`` - 1 of an endless supply."""
+    """Pool that holds at turn t the batches t to t + ``plans`` - 1 of an endless supply."""
 
     def __init__(self, rooms: RoomSampler, plans: int, clips: int, worker: Worker) -> None:
-        """Batches are of so many ``clips``."""
+        """``clips`` is the number of clips in a batch."""
         self._rooms, self._plans, self._clips = rooms, plans, clips
         self._ahead = PlansAhead(rooms, clips, worker)
         self._stored: StoredClips | None = None
         self._turn = 0
 
     def at(self, turn: int) -> StoredClips:
-        """The clips of a turn; what was not there yet is rendered, and takes the oldest's place."""
+        """The clips of a turn; missing batches are rendered and replace the oldest."""
         if self._stored is None or not self._turn <= turn <= self._turn + self._plans:
             self._stored, self._turn = None, turn
             missing = range(turn, turn + self._plans)
@@ -72,7 +72,7 @@ class ClipPool:
         return self._stored
 
     def empty(self) -> None:
-        """Free what is stored, and draw nothing ahead until clips are asked for again."""
+        """Free the stored clips, and draw nothing ahead until the next call of ``at``."""
         self._stored = None
         self._ahead.rest()
 

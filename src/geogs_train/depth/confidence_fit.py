@@ -1,4 +1,4 @@
-"""Calibration of the deviations and confidences of the depth network."""
+"""Calibration of the standard deviations and confidences of the depth network."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,15 +8,15 @@ from geogs.depth.network.depth_calibration import TOLERANCE, DepthCalibration, r
 from geogs_train.depth.depth_scores import DepthErrors
 
 BELIEVED = 0.5
-"""Probability of an outlier below which a pixel's deviation is calibrated."""
+"""Probability of an outlier below which a pixel's standard deviation is calibrated."""
 _STEPS = 50
 
 
 def calibrated(pixels: DepthErrors) -> DepthCalibration:
-    """Calibration fitted to pixels of rooms that the network was not trained on.
+    """Fit the calibration to pixels of rooms that the network was not trained on.
 
-    Scales are multiplied so that as many errors lie within two deviations as of a Laplace
-    distribution; the chance to be right is fitted by logistic regression.
+    Scales are multiplied so that as many errors lie within two standard deviations as of a Laplace
+    distribution; the probability to be right is fitted by logistic regression.
     """
     scale = pixels.deviation / 2**0.5
     ratio = (pixels.error.abs() / scale)[pixels.outlier < BELIEVED]
@@ -30,9 +30,9 @@ def calibrated(pixels: DepthErrors) -> DepthCalibration:
 
 
 def logistic_fit(x: Float[Tensor, "n"], right: Bool[Tensor, "n"]) -> tuple[float, float]:
-    """Gain and offset of the logit that make the outcomes likeliest, by Newton's method.
+    """Maximum-likelihood gain and offset of the logit, by Newton's method.
 
-    A likelihood, not a sum of squares: the least-squares loop has no place for it.
+    The likelihood is no sum of squares, so the least-squares loop cannot be used.
     """
     X = torch.stack([x, torch.ones_like(x)], 1)
     w = X.new_tensor([1.0, 0.0])
@@ -48,6 +48,6 @@ def logistic_fit(x: Float[Tensor, "n"], right: Bool[Tensor, "n"]) -> tuple[float
 
 
 def _quantile(values: Float[Tensor, "n"], fraction: float) -> Float[Tensor, ""]:
-    """A quantile of any number of values."""
+    """A quantile of values, without ``torch.quantile``'s limit on their number."""
     ordered = values.sort().values
     return ordered[min(int(fraction * len(values)), len(values) - 1)]

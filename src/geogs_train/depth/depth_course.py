@@ -1,4 +1,4 @@
-"""The depth network's course: keyframes drawn from pools of clips of random rooms."""
+"""The depth network's training course: keyframes drawn from pools of clips of random rooms."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ CALIBRATION_BATCHES, CALIBRATION_SEED = 6, 9
 
 
 class DepthCourse:
-    """Small images first, then large ones, each size with a pool of its own."""
+    """Training on small images first, then on large ones, each size with its own pool."""
 
     weights = "depth.safetensors"
     curves: Panels = (
@@ -52,18 +52,18 @@ class DepthCourse:
         self._held_out: DepthValidation | None = None
 
     def network(self) -> DepthNetwork:
-        """With random weights, on the CPU."""
+        """Make a network with random weights, on the CPU."""
         return DepthNetwork(self.options.network)
 
     def compile(self, network: DepthNetwork) -> None:
-        """What sees batches of one size, whatever the number of neighbours."""
+        """Compile the parts with constant batch sizes, whatever the number of neighbours."""
         for part in (network.context, network.body):
             part.compile(dynamic=False)
 
     @torch.no_grad()
     def batch(self, step: int, progress: float) -> DepthBatch:
-        """The size of the images, by the fraction of the run that is done, and the number of
-        neighbours are those of all workers."""
+        """Draw a batch; the size of its images, by the finished fraction of the run, and the number
+        of neighbours are equal for all workers."""
         options = self.options
         small = progress < options.small
         if not small:
@@ -78,11 +78,11 @@ class DepthCourse:
         return replace(batch, progress=progress)
 
     def loss(self, network: DepthNetwork, batch: DepthBatch) -> Float[Tensor, ""]:
-        """Nothing random."""
+        """Loss of a batch; deterministic."""
         return depth_loss(network(batch.views), batch, self.options.loss)
 
     def validation(self, batches: int) -> DepthValidation:
-        """The validation set."""
+        """Make the validation set."""
         found = DepthValidation(self.options, self.worker.device, batches)
         count = min(batches, CALIBRATION_BATCHES)
         self._held_out = DepthValidation(
@@ -91,12 +91,12 @@ class DepthCourse:
         return found
 
     def load(self, path: Path) -> DepthNetwork:
-        """The network of a file of weights."""
+        """Load the network of a file of weights."""
         return load_depth_network(path).requires_grad_(True)
 
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
-        """Write weights as they are shipped; calibrated on rooms that neither training nor
-        validation show."""
+        """Write weights for shipping, calibrated on rooms that neither training nor validation
+        use."""
         assert self._held_out is not None  # made with the validation set
         calibration = calibrated(DepthErrors.join(self._held_out.errors(network)))
         write_weights(network, path, step, scores=scores, calibration=calibration)

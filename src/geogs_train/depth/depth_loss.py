@@ -1,8 +1,7 @@
 """The loss of the depth network: depth, its deviation, normals, their concentration.
 
-All of it is unit-free: depths are compared in their logarithms. Deviations, outliers and
-concentrations learn from the likelihood of errors that are detached, so that hard pixels are not
-given up.
+All of it is unit-free: depths are compared in their logarithms. Standard deviations, outliers and
+concentrations learn from the likelihood of detached errors, so that hard pixels are not given up.
 """
 
 import math
@@ -19,15 +18,15 @@ from geogs_train.depth.depth_options import DepthLossOptions
 from geogs_train.depth.depth_tuples import DepthBatch, has_truth
 
 SMOOTH = 0.985
-"""Cosine between true normals and those of true depth from which on a pixel is no edge."""
+"""Least cosine between true normals and those of true depth of a pixel that is no edge."""
 CELL_SPREAD = 0.05
-"""Difference of log depth within a coarse cell from which on it has no one depth."""
+"""Range of log depth in a coarse cell from which it has two depths."""
 NEAR_EDGE = 4
-"""Pixels around a pixel within which another depth makes it one of an edge."""
+"""Pixels around a pixel within which another depth makes it an edge pixel."""
 CHOICE = 0.15
-"""Temperature of the targets for the depths tried at 1/2, in steps between planes."""
+"""Temperature of the targets for the tried depths at 1/2, in steps between planes."""
 SCALES = 4
-"""Scales of differences, each twice as far apart."""
+"""Number of scales of differences; each has twice the distance of the one before."""
 
 
 def depth_loss(
@@ -36,7 +35,7 @@ def depth_loss(
     """The sum of all parts."""
     valid = has_truth(batch)
     typical = batch.views.typical[:, None, None].expand_as(batch.depth)
-    # A ray may meet nothing: what is not valid must be a number all the same.
+    # A ray may meet nothing, but invalid pixels must be numbers, too.
     truth = (torch.where(valid, batch.depth, typical) / typical).log()
     error = found.log_depth - truth
     at_edge = spread_around(truth, valid, NEAR_EDGE) > CELL_SPREAD
@@ -61,7 +60,7 @@ def depth_loss(
         total = total + weight * plane_loss(logits, found.log_planes, truth, valid)
 
     late = float(batch.progress >= options.late)
-    # The angle's slope is infinite where it is zero.
+    # The derivative of the angle is infinite at zero.
     angle = (found.normal * batch.normal).sum(1).clamp(-1 + 1e-5, 1 - 1e-5).arccos()
     total = total + options.normal * _mean(angle, valid)
     spread = angular(angle.detach(), found.concentration)
@@ -74,8 +73,8 @@ def depth_loss(
 def surfaces_of_cells(
     log_depth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"], cell: int
 ) -> tuple[Float[Tensor, "b h2 w2"], Float[Tensor, "b h2 w2"], Bool[Tensor, "b h2 w2"]]:
-    """Depths of cells of ``cell`` x ``cell`` pixels, and where all pixels of a cell are known: the
-    mean of a cell that lies on one surface twice, else its nearest and its farthest pixel."""
+    """Two depths of each cell of ``cell`` x ``cell`` pixels (twice the mean of a cell on one
+    surface, else its nearest and farthest pixel), and a mask of the fully known cells."""
     depth = log_depth[:, None]
     mean = functional.avg_pool2d(depth, cell)[:, 0]
     farthest = functional.max_pool2d(depth, cell)[:, 0]
@@ -88,14 +87,14 @@ def surfaces_of_cells(
 def from_either(
     found: Float[Tensor, "b h w"], nearest: Float[Tensor, "b h w"], farthest: Float[Tensor, "b h w"]
 ) -> Float[Tensor, "b h w"]:
-    """Distance from the closer of two surfaces, between which there is no depth."""
+    """Distance to the closer of two surfaces, between which there is no depth."""
     return torch.minimum((found - nearest).abs(), (found - farthest).abs())
 
 
 def spread_around(
     log_depth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"], reach: int
 ) -> Float[Tensor, "b h w"]:
-    """Largest less smallest depth of the known pixels within ``reach`` across and down."""
+    """Largest minus smallest depth of the known pixels within ``reach`` across and down."""
     size = 2 * reach + 1
     low = torch.where(valid, log_depth, torch.inf)[:, None]
     high = torch.where(valid, log_depth, -torch.inf)[:, None]
@@ -106,8 +105,8 @@ def spread_around(
 def choice_loss(
     found: DepthPrediction, truth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of the depths tried at 1/2 with those nearest to the truth, in cells of one
-    surface that one of them lies on."""
+    """Cross-entropy of the tried depths at 1/2 with those nearest to the truth, in cells of one
+    surface near which one of them lies."""
     depth, farthest, known = surfaces_of_cells(truth, valid, 2)
     rows, columns = depth.shape[1:]
     step = torch.diff(found.log_planes, dim=1).mean(1)[:, None, None, None]
@@ -119,7 +118,7 @@ def choice_loss(
 
 
 def gradient_loss(error: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]) -> Tensor:
-    """Differences of errors of pixels 1, 2, 4, ... apart: absolute, mean over the scales."""
+    """Mean absolute differences of the errors of pixels 1, 2, 4, ... apart, over the scales."""
     total = error.new_zeros(())
     for level in range(SCALES):
         step = 2**level
@@ -135,8 +134,8 @@ def plane_loss(
     truth: Float[Tensor, "b h w"],
     valid: Bool[Tensor, "b h w"],
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of the planes with the two beside the truth, by their nearness; in a cell of
-    two surfaces with those beside either."""
+    """Cross-entropy of the planes with the two next to the truth, by their nearness; in a cell of
+    two surfaces with those next to either."""
     nearest, farthest, known = surfaces_of_cells(truth, valid, 4)
     log = logits[..., : known.shape[1], : known.shape[2]].log_softmax(1)
     near, inside = _log_likelihood(log, log_planes, nearest)
@@ -148,7 +147,7 @@ def plane_loss(
 def _log_likelihood(
     log: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d"], depth: Float[Tensor, "b h w"]
 ) -> tuple[Float[Tensor, "b h w"], Bool[Tensor, "b h w"]]:
-    """Log-likelihood of depths, interpolated between planes; and where they lie among them."""
+    """Log-likelihood of depths, interpolated between planes, and a mask of those among them."""
     planes = log_planes.shape[1]
     step = plane_step(log_planes)[:, None, None]
     place = ((depth - log_planes[:, :1, None]) / step).nan_to_num(-1.0)
@@ -169,8 +168,8 @@ def angular(angle: Tensor, concentration: Tensor) -> Tensor:
 
 
 def outlier_laplace(error: Tensor, log_scale: Tensor, outlier: Tensor, log_range: Tensor) -> Tensor:
-    """Negative log-likelihood of errors: Laplace, or with the probability of an outlier anything
-    in the range."""
+    """Negative log-likelihood of errors: Laplace, or with the probability of an outlier uniform in
+    the range."""
     inlier = -error.abs() * (-log_scale).exp() - log_scale - math.log(2)
     return -torch.logaddexp(
         functional.logsigmoid(-outlier) + inlier, functional.logsigmoid(outlier) - log_range.log()
@@ -178,5 +177,5 @@ def outlier_laplace(error: Tensor, log_scale: Tensor, outlier: Tensor, log_range
 
 
 def _mean(values: Tensor, chosen: Tensor) -> Float[Tensor, ""]:
-    """Mean of the chosen values; 0 where none is."""
+    """Mean of the chosen values; 0 if none is."""
     return torch.where(chosen, values, 0.0).sum() / chosen.sum().clamp_min(1)

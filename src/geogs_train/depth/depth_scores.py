@@ -1,4 +1,4 @@
-"""Scores of depths and normals on textured, faint and bare surfaces, and their calibration."""
+"""Scores of depths and normals on textured, faint and bare surfaces, and of their calibration."""
 
 from dataclasses import asdict, dataclass
 
@@ -8,36 +8,36 @@ from torch import Tensor
 from torch.nn import functional
 
 FAINT, TEXTURED = 0.4, 2.0
-"""Gradient of the undisturbed picture in 8-bit levels per pixel, root mean square over 9 x 9
-pixels: less is bare, more is textured, between them it is faint."""
+"""Gradients of the undisturbed picture in 8-bit levels per pixel, root mean square over 9 x 9
+pixels: below the first a surface is bare, above the second textured, between them faint."""
 KINDS = ("textured", "faint", "bare")
 
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors of pixels, a row each."""
+    """Errors of pixels, one row each."""
 
     error: Float[Tensor, "n"]
-    """Logarithm of found over true depth."""
+    """Logarithm of estimated over true depth."""
     deviation: Float[Tensor, "n"]
     """Predicted standard deviation of that."""
     outlier: Float[Tensor, "n"]
     """Predicted probability that the depth is an outlier."""
     angle: Float[Tensor, "n"]
-    """Between found and true normals, degrees."""
+    """Angle between estimated and true normals, degrees."""
     kind: UInt8[Tensor, "n"]
     """Index into ``KINDS``."""
 
     @staticmethod
     def join(parts: "list[DepthErrors]") -> "DepthErrors":
-        """All pixels of several batches."""
+        """Join the pixels of several batches."""
         rows = zip(*(vars(part).values() for part in parts), strict=True)
         return DepthErrors(*map(torch.cat, rows))
 
 
 @dataclass(frozen=True)
 class DepthScores:
-    """Over pixels of unseen rooms."""
+    """Scores over pixels of unseen rooms."""
 
     absolute: float
     """Mean relative error of depth."""
@@ -50,11 +50,11 @@ class DepthScores:
     normal: float
     """Median error of normals, degrees."""
     within: float
-    """Fraction of the pixels believed (outlier below 1/2) that err by less than two deviations."""
+    """Fraction of the accepted pixels (outlier below 1/2) with errors below two deviations."""
     believed: float
     """Fraction of pixels whose predicted probability to be an outlier is below 1/2."""
     sure: float
-    """Fraction of pixels with a deviation below 3 %, believed."""
+    """Fraction of pixels that are accepted and have a standard deviation below 3 %."""
     sure_absolute: float
     """Mean relative error of those."""
     textured_absolute: float
@@ -67,10 +67,10 @@ class DepthScores:
     bare_within_5: float
     bare_normal: float
     scale: float
-    """Mean over the believed pixels of absolute error over Laplace scale: 1 if calibrated."""
+    """Mean over the accepted pixels of absolute error over Laplace scale: 1 if calibrated."""
 
     def line(self) -> str:
-        """On one line."""
+        """Format on one line."""
         return "  ".join(f"{name} {value:.4f}" for name, value in asdict(self).items())
 
 

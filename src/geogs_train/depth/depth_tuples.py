@@ -1,4 +1,4 @@
-"""Samples from a pool of clips: a keyframe and neighbours, with errors such as a tracker's."""
+"""Samples from a pool of clips: a keyframe and neighbours, with errors like a tracker's."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from geogs_train.depth.clip_pool import StoredClips
 from geogs_train.depth.depth_options import TupleOptions
 
 MOST_TURN = math.radians(40)
-"""Angle between viewing directions from which on a view is no good neighbour."""
+"""Largest angle between viewing directions of a good neighbour."""
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,20 @@ class DepthBatch:
     place: Int[Tensor, "b 2"]
     """Clip in the pool, view in the clip."""
     progress: float = 1.0
-    """Fraction of the run that is done."""
+    """Finished fraction of the run."""
 
 
 def draw_tuples(
     clips: StoredClips, count: int, neighbours: int, options: TupleOptions, draw: Draw
 ) -> DepthBatch:
-    """``count`` keyframes with ``neighbours`` each, drawn and disturbed."""
+    """Draw and disturb ``count`` keyframes with ``neighbours`` each."""
     total, views = clips.depth.shape[:2]
     clip, view = draw.integers(total, count), draw.integers(views, count)
     others = choose_neighbours(clips, clip, view, neighbours, options, draw)
     T = clips.T_cw[clip]
     own = T[torch.arange(count, device=draw.device), view]
     relative = T.gather(1, others[..., None, None].expand(-1, -1, 4, 4)) @ se3_inverse(own)[:, None]
-    # Some neighbours show another room, some are not there.
+    # Some neighbours show another room, some are missing.
     strange = draw.chance(options.dud, count, neighbours)
     shown = torch.where(strange, draw.integers(total, count, neighbours), clip[:, None])
     valid = ~draw.chance(options.missing, count, neighbours)
@@ -81,7 +81,7 @@ def choose_neighbours(
     options: TupleOptions,
     draw: Draw,
 ) -> Int[Tensor, "b k"]:
-    """Views of the same clips: good ones first, in any order, then those nearest to good."""
+    """Choose views of the same clips: good ones first, in random order, then the nearly good."""
     T = clips.T_cw[clip]
     rows = torch.arange(len(clip), device=clip.device)
     centre = -(T[..., :3, :3].mT @ T[..., :3, 3:])[..., 0]
@@ -105,8 +105,8 @@ def known_range(
     options: TupleOptions,
     draw: Draw,
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
-    """Nearest, farthest and median depth as a tracker would know them; about half the depths
-    beyond the quantiles are left out at worst."""
+    """Nearest, farthest and median depth with a tracker's errors; at worst they leave out about
+    half the depths beyond the quantiles."""
     n = len(low)
     near = 0.5 * low / _log_uniform(draw, options.range_error, n)
     far = 2.0 * high * _log_uniform(draw, options.range_error, n)
@@ -119,21 +119,21 @@ def known_range(
 def disturbed_poses(
     T: Float[Tensor, "b k 4 4"], options: TupleOptions, draw: Draw
 ) -> Float[Tensor, "b k 4 4"]:
-    """Poses with errors such as a tracker's, in a fraction of the samples."""
+    """Add a tracker's errors to the poses of a fraction of the samples."""
     b, k = T.shape[:2]
     wrong = draw.chance(options.disturbed, b, 1, 1).float()
     degrees = _log_uniform(draw, options.rotation, b, 1, 1)
     rotation = torch.deg2rad(degrees) * draw.normal(1.0, b, k, 3)
     baseline = T[..., :3, 3].norm(dim=-1, keepdim=True)
     shift = _log_uniform(draw, options.translation, b, 1, 1) * baseline * draw.normal(1.0, b, k, 3)
-    # About the neighbour's own centre: a rotation alone leaves the baseline as it is.
+    # About the neighbour's own centre: a rotation alone does not change the baseline.
     return se3_exp(wrong * torch.cat([shift, rotation], -1)).to(T) @ T
 
 
 def relit(
     images: Float[Tensor, "b v 3 h w"], strength: float, draw: Draw
 ) -> Float[Tensor, "b v 3 h w"]:
-    """Images with random exposure, white balance and tone, each a little different, and noise."""
+    """Change exposure, white balance and tone of each image a little, at random, and add noise."""
     b, v = images.shape[:2]
 
     def vary(deviation: float, *channels: int) -> Float[Tensor, "b v c 1 1"]:
@@ -146,13 +146,13 @@ def relit(
 
 
 def _log_uniform(draw: Draw, bounds: tuple[float, ...], *shape: int) -> Float[Tensor, "..."]:
-    """As ``Draw.log_uniform``, but rounded otherwise: networks were trained with these numbers."""
+    """Like ``Draw.log_uniform``, but rounded as in the training of the shipped networks."""
     low, high = (math.log(x) for x in bounds)
     return (low + (high - low) * draw.uniform(0, 1, *shape)).exp()
 
 
 def has_truth(batch: DepthBatch) -> Bool[Tensor, "b h w"]:
-    """Pixels whose depth lies in what may be searched, or nearly."""
+    """Mask of the pixels with a depth in the search range, or nearly."""
     near, far = (x[:, None, None] for x in (batch.views.near, batch.views.far))
     known = batch.depth.isfinite() & (batch.views.typical > 0)[:, None, None]
     return known & (batch.depth > 0.5 * near) & (batch.depth < 2 * far)

@@ -1,4 +1,4 @@
-"""The fixed validation set: tuples of rooms and textures that training never shows."""
+"""The fixed validation set: tuples of rooms and textures that training never uses."""
 
 from dataclasses import replace
 
@@ -18,11 +18,11 @@ from geogs_train.depth.depth_tuples import DepthBatch, draw_tuples
 
 SEED = 3141
 EVERY = 3
-"""Step between the pixels that are scored, across and down."""
+"""Step between the scored pixels, across and down."""
 
 
 class DepthValidation:
-    """Keyframes of one size with neighbours; drawn once, kept on the device."""
+    """Validation keyframes of one size with neighbours; drawn once, kept on the device."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The flow network's course: flow of pairs of views."""
+"""The flow network's training course: flow of pairs of views."""
 
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from geogs_train.flow.starts import StartOptions
 from geogs_train.trained_weights import write_weights
 
 LEAST_PROCESSES = 3
-"""Draw plans for a GPU: a step of this network is short."""
+"""Fewest processes that draw plans for a GPU: a step of this network is short."""
 
 
 class FlowCourse:
-    """Every step films other rooms."""
+    """Training with new rooms in every step."""
 
     recordable = True
     """Whether loss and gradients may be recorded as a CUDA graph."""
@@ -51,37 +51,37 @@ class FlowCourse:
         self._plans = PlansAhead(self.rooms, options.batch, worker, LEAST_PROCESSES)
 
     def network(self) -> FlowNetwork:
-        """With random weights, on the CPU."""
+        """Make a network with random weights, on the CPU."""
         return FlowNetwork(self.options.network)
 
     def compile(self, network: FlowNetwork) -> None:
-        """The parts that are worth it."""
+        """Compile the parts for which it pays."""
         network.encoder.compile(dynamic=False)
         network.update.compile(dynamic=False)
 
     def batch(self, step: int, progress: float) -> FlowBatch:
-        """Every ordered pair of neighbouring views, from disturbed starts; all that is random is
-        drawn here, the same whenever the step is asked for."""
+        """Batch of every ordered pair of neighbouring views, with disturbed starts; all randomness
+        is here, and depends only on the step."""
         clips = self.rooms.film(self._plans.plan(step))
         generator = self.worker.generator(self.options.seed, step)
         with torch.no_grad():
             return flow_batch(clips, StartOptions(far=self.options.far), generator)
 
     def loss(self, network: FlowNetwork, batch: FlowBatch) -> Float[Tensor, ""]:
-        """The flow of all iterations and its likelihood."""
+        """Loss of the flow of all iterations and of its likelihood."""
         found = run_network(network, batch, self.options.iterations)
         return flow_loss(*found, batch, self.options)
 
     def validation(self, batches: int) -> SceneValidation:
-        """The validation set."""
+        """Make the validation set."""
         return SceneValidation(self.options, self.worker.device, batches)
 
     def load(self, path: Path) -> FlowNetwork:
-        """The network of a file of weights."""
+        """Load the network of a file of weights."""
         return load_flow_network(path)
 
     def export(self, network: FlowNetwork, path: Path, step: int, scores: SceneScores) -> None:
-        """Write weights as they are shipped."""
+        """Write weights for shipping."""
         write_weights(network, path, step, scores=scores)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Estimates of the flow network for a batch, and the loss that it is trained by."""
+"""Estimates of the flow network for a batch, and its training loss."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 
 MAX_ERROR = 100.0
-"""Errors in pixels are clamped here: how far a lost cell is off teaches nothing."""
+"""Limit to which errors are clamped, pixels: the size of a lost cell's error is no information."""
 
 
 def run_network(
@@ -56,12 +56,12 @@ def flow_loss(
 
 
 def descriptor_loss(features: FlowFeatures, batch: FlowBatch) -> Float[Tensor, ""]:
-    """Cross-entropy of windows around the probes with the place of the truth in them.
+    """Cross-entropy of windows around the probes with the position of the truth in them.
 
-    A window is read as logits over its 49 places; the truth is shared by the four around it.
+    A window is read as logits over its 49 positions; the truth is split over the four around it.
     Cells that the second view does not see, and levels whose window misses the truth, do not count.
-    Sum over the levels of the mean over the cells. It makes descriptors tell places apart within
-    the first hundreds of steps; the flow's error alone takes thousands.
+    Sum over the levels of the mean over the cells. With it descriptors become distinctive within
+    the first hundreds of steps; with the flow's error alone that takes thousands.
     """
     windows = correlation_windows(features.source, features.pyramid, batch.edges, batch.probe)
     windows = windows.unflatten(-1, (-1, WINDOW)).log_softmax(-1)

@@ -1,4 +1,4 @@
-"""Training batches of the flow network, made of clips: images, edges, true flow, starts."""
+"""Training batches of the flow network from clips: images, edges, true flow, starts."""
 
 import math
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from geogs_synth.clips.room_options import PAPERED
 from geogs_train.flow.starts import StartOptions, disturbed_starts
 
 REPEATING = 5.0
-"""Largest disturbance in pixels where patterns repeat: the right one of them is the nearest."""
+"""Largest disturbance for repeating patterns, pixels: the right repeat is then the nearest."""
 MARGIN = 48
-"""Cells that lie further outside the second image, in pixels, teach nothing."""
+"""Pixels outside the second image beyond which cells do not count."""
 PROBE = 1.0, 100.0
 """Least and largest distance of a probe from the truth, pixels."""
 
@@ -33,10 +33,10 @@ class FlowBatch:
     """True position of every pixel in the second image."""
     visible: Bool[Tensor, "e h w"]
     known: Bool[Tensor, "e h w"]
-    """Whether the pixel lies before the second camera and near enough to its image."""
+    """Mask of the pixels in front of the second camera and near enough to its image."""
     start: Float[Tensor, "e p 2"]
     probe: Float[Tensor, "e p 2"]
-    """Positions near the truth, where descriptors are asked to point to it."""
+    """Positions near the truth, from which descriptors have to point to it."""
 
     @property
     def flow(self) -> Float[Tensor, "e h w 2"]:
@@ -49,12 +49,12 @@ class FlowBatch:
         return self.truth - torch.stack([u, v], -1)
 
     def at_cells(self, field: Tensor) -> Tensor:
-        """A field (e, h, w, ...) on the cells, row by row."""
+        """Sample a field (e, h, w, ...) at the cells, row by row."""
         return _at_cells(field).flatten(1, 2)
 
 
 def flow_batch(clips: ClipBatch, options: StartOptions, generator: torch.Generator) -> FlowBatch:
-    """Every ordered pair of neighbouring views of every clip."""
+    """Make a batch of every ordered pair of neighbouring views of every clip."""
     count, views, _, height, width = clips.images.shape
     pairs = [(i, j) for i in range(views) for j in (i - 1, i + 1) if 0 <= j < views]
     base = views * torch.arange(count, dtype=torch.int32, device=clips.images.device)

@@ -1,4 +1,4 @@
-"""Scores of flow: error, fraction of outliers, calibration of the predicted deviations."""
+"""Scores of flow: error, fraction of outliers, calibration of the predicted uncertainty."""
 
 from dataclasses import asdict, dataclass
 
@@ -10,14 +10,14 @@ from torch.nn import functional
 from geogs.tracking.flow.cell_texture import MIN_STRUCTURE
 
 LARGE_MOTION = 16.0
-"""Pixels from which on a motion counts as large."""
+"""Least large motion, pixels."""
 OUTLIER = 1.0
-"""Pixels beyond which a flow counts as an outlier."""
+"""Largest error of an inlier, pixels."""
 
 
 @dataclass(frozen=True)
 class FlowScores:
-    """Errors over visible pixels, in pixels unless said."""
+    """Errors over visible pixels, in pixels unless stated."""
 
     dense: float
     """Mean end-point error of every pixel."""
@@ -30,18 +30,18 @@ class FlowScores:
     large: float
     """Mean over cells that move by more than 16 pixels."""
     outliers: float
-    """Fraction of cells that are off by more than a pixel."""
+    """Fraction of cells with errors above a pixel."""
     within: float
-    """Fraction of cells whose error along x and y lies within two predicted deviations."""
+    """Fraction of cells with errors in x and y within two predicted standard deviations."""
     within_visible_large: float
     """The same over cells that move by more than 16 pixels."""
     sure_share: float
-    """Fraction of cells whose predicted deviation is below half a pixel."""
+    """Fraction of cells with a predicted standard deviation below half a pixel."""
     sure_error: float
     """Mean error of those."""
 
     def line(self) -> str:
-        """On one line."""
+        """Format on one line."""
         return "  ".join(f"{name} {value:.3f}" for name, value in asdict(self).items())
 
 
@@ -52,7 +52,7 @@ class CellErrors:
     error: Float[Tensor, "n 2"]
     """Pixels."""
     deviation: Float[Tensor, "n 2"]
-    """Predicted, pixels."""
+    """Predicted standard deviation, pixels."""
     motion: Float[Tensor, "n"]
     """Length of the true flow, pixels."""
     textured: Bool[Tensor, "n"]
@@ -83,7 +83,7 @@ def summarise(parts: list[CellErrors]) -> FlowScores:
 
 
 def has_texture(images: Float[Tensor, "n 3 h w"]) -> Bool[Tensor, "n h w"]:
-    """Where the structure tensor over 9 x 9 pixels has no small eigenvalue: the tracker's test."""
+    """Mask where the structure tensor over 9 x 9 pixels has no small eigenvalue, as in tracking."""
     weights = images.new_tensor([0.299, 0.587, 0.114]) * 255
     grey = (images * weights[:, None, None]).sum(1, keepdim=True)
     kernel = images.new_tensor([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8

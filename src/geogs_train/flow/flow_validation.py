@@ -1,4 +1,4 @@
-"""The fixed validation set: rooms and textures that training never shows."""
+"""The fixed validation set: rooms and textures that training never uses."""
 
 from dataclasses import dataclass, replace
 
@@ -19,20 +19,20 @@ SEED = 2718
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores on the kinds of scenes that a network is trained with."""
+    """Scores on the kinds of scenes in a network's training."""
 
     usual: FlowScores
     others: dict[str, FlowScores]
     """Scores by the names of :class:`SceneWeights`."""
 
     def line(self) -> str:
-        """On a line for each kind."""
+        """Format on a line for each kind."""
         rows = {"usual": self.usual, **self.others}
         return "\n".join(f"{name:8} {scores.line()}" for name, scores in rows.items())
 
 
 class SceneValidation:
-    """One validation set for each kind of scene; the usual one is always there."""
+    """One validation set for each kind of scene; always with the usual one."""
 
     def __init__(self, options: FlowTraining, device: torch.device, batches: int) -> None:
         self._usual = Validation(options, device, batches)
@@ -50,7 +50,7 @@ class SceneValidation:
 
 
 class Validation:
-    """Batches of unseen scenes of one kind, made again whenever they are needed."""
+    """Batches of unseen scenes of one kind, rendered on demand."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Validation:
         self.batches, self._batch, self._device = batches, options.batch, device
 
     def batch(self, number: int, starts: StartOptions | None = None) -> FlowBatch:
-        """The directed pairs of a batch, with the starts of the training if no others."""
+        """Directed pairs of a batch, with the starts of the training unless others are given."""
         generator = torch.Generator(self._device)
         generator.manual_seed(SEED + number)
         return flow_batch(

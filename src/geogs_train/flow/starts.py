@@ -1,4 +1,4 @@
-"""Where a tracker would begin: the true flow, disturbed as wrong poses and depths disturb it."""
+"""Start positions like a tracker's: the true flow with errors from wrong poses and depths."""
 
 import math
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from geogs.geometry.lie import se3_exp
 
 @dataclass(frozen=True)
 class StartOptions:
-    """How far off the network is started."""
+    """Errors of the network's start positions."""
 
     smallest: float = 0.05
-    """Mean disturbance in pixels at least, drawn log-uniformly."""
+    """Least mean disturbance, which is drawn log-uniformly, pixels."""
     largest: float = 16.0
     cold: float = 0.15
-    """Fraction of the edges that start from no motion at all."""
+    """Fraction of the edges that start from zero motion."""
     bleed: float = 0.6
-    """Fraction of the edges whose depth is blurred over the edges of things."""
+    """Fraction of the edges whose depth is blurred over object boundaries."""
     far: float = 0.0
-    """Fraction of the edges, beside the cold ones, that are off by between ``largest`` and
+    """Fraction of the edges, besides the cold ones, with a disturbance between ``largest`` and
     ``farthest``."""
     farthest: float = 64.0
 
@@ -39,11 +39,11 @@ def disturbed_starts(
     generator: torch.Generator,
     largest: Float[Tensor, "b"] | None = None,
 ) -> Float[Tensor, "b gh gw 2"]:
-    """Positions in the second view by a wrong pose and wrong depths, scaled to a drawn amount.
+    """Positions in the second view with a wrong pose and wrong depths, scaled to a drawn amount.
 
     ``truth`` are the true positions in pixels, ``rays`` the cells' K^-1 (x, y, 1), ``T_ji`` takes
     points of the first view to the second. ``largest`` is each edge's largest mean disturbance,
-    where it is not that of the options.
+    if it is not that of the options.
     """
     n, device = len(truth), truth.device
 
@@ -64,7 +64,7 @@ def disturbed_starts(
         amount = torch.where(uniform() < options.far, options.largest * beyond, amount)
     inverse = 1 / depth.clamp(min=1e-2)
     middle = inverse.flatten(1).median(1).values
-    # Depth: bled over edges, scaled by a smooth field, in places by noise.
+    # Depth: blurred over edges, scaled by a smooth field, in some regions by noise.
     size = (int(inverse.shape[1]), int(inverse.shape[2]))
     blurred = _blur(_blur(inverse))
     inverse = torch.where(column(uniform() < options.bleed), blurred, inverse)
@@ -73,7 +73,7 @@ def disturbed_starts(
     inverse = inverse * (0.6 * column(strength) * field[:, 0]).exp()
     patches = _smooth_field(normal(2, 6, 8), size)
     inverse = inverse * (1.5 * column(strength) * (patches[:, 0] - 1).clamp(min=0)).exp()
-    # Pose: turned by up to the amount, moved by a fraction of the depth.
+    # Pose: rotated by about the amount, moved by a fraction of the depth.
     focal = intrinsics[:, 0]
     rotation = normal(3) * (0.5 * amount / focal)[:, None]
     shift = normal(3) * (0.5 * amount / focal / middle.clamp(min=1e-3))[:, None]

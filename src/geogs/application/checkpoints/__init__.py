@@ -1,1 +1,1 @@
-"""Checkpoints: the state of some work, kept in its folder to go on from."""
+"""Checkpoints: the state of some work, stored in its folder to resume from."""

@@ -1,9 +1,9 @@
-"""Checkpoints: the state of some work in ``checkpoint/`` of its results, to go on from later.
+"""Checkpoints: the state of some work in ``checkpoint/`` of its results, to resume from.
 
-The state, a record, is taken apart (:mod:`geogs.world.pack`) into JSON and a safetensors
+The state, a record, is split (:mod:`geogs.world.pack`) into JSON and a safetensors
 file; large arrays of old keyframes lie in archives beside them, which only grow or are written
-where the last complete state refers to nothing. What belongs to the process (device, flow operator,
-prior, kernels, threads) is not stored: whoever reads has it.
+where the last complete state refers to nothing. Objects of the process (device, flow operator,
+prior, kernels, threads) are not stored: the reading process has its own.
 """
 
 import json
@@ -31,14 +31,14 @@ from geogs.world.pack import pack, unpack
 S = TypeVar("S")
 
 _UNUSABLE = (OSError, InputError, SafetensorError, MemoryError, RuntimeError, *UNUSABLE)
-"""What reading a file may end with that somebody made up."""
+"""Errors of reading an untrusted file."""
 
 _MAX_TIME_FRACTION = 0.05
 """Fraction of the time of the work that writing checkpoints may take."""
 
 
 class Checkpoint:
-    """Writes the state of some work now and then; says once where that fails, and goes on."""
+    """Writes the state of some work at intervals; a failure is reported once, and work goes on."""
 
     def __init__(
         self,
@@ -48,9 +48,9 @@ class Checkpoint:
         progress: RunProgress,
         stopwatch: Stopwatch,
     ) -> None:
-        """Write into a folder of results, every so many seconds, never if 0.
+        """Write into a folder of results every ``every`` seconds, never if 0.
 
-        ``state`` gives the record to write; none while there is nothing to go on from.
+        ``state`` gives the record to write; none while there is nothing to resume from.
         """
         self._folder = checkpoint_folder(output)
         self._every = every
@@ -59,15 +59,15 @@ class Checkpoint:
         self._stopwatch = stopwatch
         self._due = time.perf_counter() + every
         self.is_complete = False
-        """Whether what was to be written last is there."""
+        """Whether the last write was complete."""
 
     def write_if_due(self) -> None:
-        """Write it when its time has come."""
+        """Write the state if the interval has passed."""
         if self._every > 0 and time.perf_counter() >= self._due:
             self.write()
 
     def write(self) -> bool:
-        """Write the state as it is; whether there is a complete checkpoint of it now."""
+        """Write the present state. Returns whether its checkpoint is complete."""
         with self._stopwatch("checkpoints"):
             self.is_complete = self._write()
         return self.is_complete
@@ -112,7 +112,7 @@ class SavedState(Generic[S]):
                 raise InputError("it is of another command, or another version wrote it")
             self._manifest = manifest
             self.is_own = manifest.is_own
-            """Whether this user made it, as far as can be told."""
+            """Whether this user is known to have made it."""
             self._values = json.loads(self._read("json"))
 
     def plain(self, name: str) -> Any:
@@ -124,7 +124,7 @@ class SavedState(Generic[S]):
         """A field of the state, once; tensors that were on a GPU go to ``device``.
 
         Raises:
-            InputError: it is not what the kind says, or an array has changed.
+            InputError: it does not match the types of the kind, or an array has changed.
         """
         with self.in_a_sentence():
             arrays, folder = load(self._read("safetensors")), self._folder
@@ -137,7 +137,7 @@ class SavedState(Generic[S]):
 
     @contextmanager
     def in_a_sentence(self) -> Iterator[None]:
-        """Whatever using it may end with becomes an InputError that says what to do."""
+        """Turn errors of using the checkpoint into an InputError with the remedy."""
         try:
             yield
         except _UNUSABLE as error:
@@ -149,14 +149,14 @@ class SavedState(Generic[S]):
             ) from error
 
     def _read(self, ending: str) -> bytes:
-        """What the file of the state with this ending holds."""
+        """Content of the state's file with this ending."""
         files = self._manifest.state
         (name,) = (name for name in files if name.endswith(f".{ending}"))
         return self._folder.read(name, files[name])
 
 
 def write_checkpoint(folder: CheckpointFolder, state: object) -> None:
-    """Write a record in place of the last, completely or not at all. Raises OutputError."""
+    """Replace the last record, completely or not at all. Raises OutputError."""
     kind = type(state)
     packed = pack(kind, state)
     with folder.replaced(schema(kind), packed.archives) as write:
@@ -174,7 +174,7 @@ def checkpoint_folder(output: Path) -> CheckpointFolder:
 
 
 def has_checkpoint(output: Path) -> bool:
-    """Whether work in a folder could be gone on with."""
+    """Whether the work of a folder can be resumed."""
     try:
         manifest = checkpoint_folder(output).manifest()
     except (OSError, InputError):

@@ -1,8 +1,8 @@
-"""``checkpoint/`` in a folder of results: complete or not there, and nothing foreign is touched.
+"""``checkpoint/`` in a folder of results: complete or absent; foreign files are never touched.
 
 A manifest names every file of ours before it is made, and only those are ever deleted. A state's
 files are new ones each time; it is complete once a manifest with their sizes and checksums has
-taken the place of the last. Files are opened by plain names in the folder; links are not followed.
+replaced the last. Files are opened by plain names in the folder; links are not followed.
 """
 
 import errno
@@ -29,13 +29,13 @@ MANIFEST = "manifest.json"
 _UNFINISHED = ".manifest.json.part"
 _OUR_NAME = re.compile(r"state-\d{1,18}\.(json|safetensors)|archive-[0-9a-f]{16}")
 _LARGEST_MANIFEST = 1 << 24
-"""Bytes; it has about a hundred for every file."""
+"""Largest manifest in bytes; it has about a hundred for every file."""
 _MODES = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}
 
 
 @dataclass(frozen=True)
 class Sum:
-    """What a file should hold."""
+    """Expected size and checksum of a file."""
 
     size: int
     """Bytes."""
@@ -49,7 +49,7 @@ class Sum:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What geogs wrote in a folder."""
+    """List of the files that geogs wrote in a folder."""
 
     format: str
     geogs: str
@@ -57,26 +57,26 @@ class Manifest:
     schema: str
     """Hash of the state's types, see :func:`geogs.world.kinds.schema`."""
     is_our_folder: bool
-    """Whether geogs made it."""
+    """Whether geogs made the folder."""
     number: int
-    """Number of the state that was begun last, from 1."""
+    """Number of the last state begun, from 1."""
     state: dict[str, Sum]
-    """The files of the complete state, but for archives, whose arrays have checksums of their own;
-    none if it was never completed."""
+    """The files of the complete state, without archives, whose arrays have checksums of their own;
+    empty if no state was completed."""
     files: list[str]
-    """All of ours that may be there, but for the manifest."""
+    """All files of ours that may exist, without the manifest."""
     is_own: bool = field(default=False, metadata=NOT_STORED)
     """Whether this user wrote it, see :mod:`geogs.application.checkpoints.seal`."""
 
 
 class CheckpointFolder:
-    """A folder that geogs makes, fills and removes; files of others there are left alone."""
+    """A folder that geogs makes, fills and removes; foreign files in it are left alone."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def manifest(self) -> Manifest | None:
-        """What was written there; None if there is no folder, or no manifest in it.
+        """Read the manifest; None if there is no folder, or no manifest in it.
 
         Raises:
             InputError: the folder or the manifest is a link, foreign, or damaged.
@@ -102,7 +102,7 @@ class CheckpointFolder:
         return replace(manifest, is_own=is_sealed(said, sealed))
 
     def read(self, name: str, wanted: Sum) -> bytes:
-        """What a file holds. Raises InputError if it is not what it should be."""
+        """Read a file. Raises InputError if its size or checksum is wrong."""
         with self._open(name, os.O_RDONLY) as file:
             size = os.fstat(file.fileno()).st_size
             if size < wanted.size:
@@ -118,9 +118,9 @@ class CheckpointFolder:
     ) -> Iterator[Callable[[str, bytes], None]]:
         """Replace the state, completely or not at all, when the block ends without an error.
 
-        Yields what writes a file of the new state, given the end of its name and its bytes; the
-        ``archives`` that it refers to are made in the block, too. What only the last state
-        consisted of is deleted.
+        Yields a function that writes a file of the new state, given the end of its name and its
+        bytes; the ``archives`` that it refers to are made in the block, too. Files of only the
+        last state are deleted.
 
         Raises:
             OutputError: the disk is full, or the folder cannot be written or is not ours.
@@ -160,7 +160,7 @@ class CheckpointFolder:
 
     @contextmanager
     def create(self, name: str) -> Iterator[BinaryIO]:
-        """A new file for reading and writing, which is gone again after an error.
+        """Open a new file for reading and writing; it is deleted after an error.
 
         Raises OSError if there is one of that name.
         """
@@ -175,7 +175,7 @@ class CheckpointFolder:
 
     @contextmanager
     def change(self, name: str) -> Iterator[BinaryIO]:
-        """A file for reading and writing. Raises InputError if it cannot be opened."""
+        """Open a file for reading and writing. Raises InputError if it cannot be opened."""
         with self._open(name, os.O_RDWR) as file:
             yield file
 
@@ -192,7 +192,7 @@ class CheckpointFolder:
                 self.path.rmdir()
 
     def _last(self) -> Manifest:
-        """The manifest so far; a new one, in a folder that there is then, if there is none."""
+        """The present manifest, or a new one; the folder is made if it is missing."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             self.path.mkdir()
@@ -207,7 +207,7 @@ class CheckpointFolder:
         return replace(last, files=[name for name in last.files if name in there])
 
     def _is_just_begun(self) -> bool:
-        """Whether there is at most what a process leaves that is killed at its first manifest."""
+        """Whether the folder is empty, or holds only an unfinished first manifest."""
         with self._opened() as folder:
             return {*os.listdir(folder)} <= {_UNFINISHED}
 
@@ -227,7 +227,7 @@ class CheckpointFolder:
             self._delete([_UNFINISHED])
             with suppress(OSError):
                 if manifest.is_our_folder:
-                    self.path.rmdir()  # it holds more, unless that was the first manifest
+                    self.path.rmdir()  # fails, unless that was the first manifest
             raise
 
     def _delete(self, names: Collection[str]) -> None:
@@ -257,7 +257,7 @@ class CheckpointFolder:
         """A file of the folder. Raises InputError if it is a link, or cannot be opened."""
         _check_name(name)
         with self._opened() as folder:
-            try:  # not to wait for who writes into a pipe
+            try:  # non-blocking, not to wait for a pipe
                 number = os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=folder)
             except OSError as error:
                 if flags & os.O_CREAT and error.errno != errno.ELOOP:
@@ -274,7 +274,7 @@ class CheckpointFolder:
 
 
 def _check_name(name: str) -> None:
-    """Raises InputError if a name is not one that geogs gives: no other file is ever touched."""
+    """Raise InputError if a name is not one of geogs: no other file is ever touched."""
     if name not in (MANIFEST, _UNFINISHED) and not _OUR_NAME.fullmatch(name):
         raise InputError(f"{name!r} is no name of a file of a checkpoint")
 

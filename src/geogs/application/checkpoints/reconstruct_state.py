@@ -14,7 +14,7 @@ from geogs.reconstruction import ReconstructionTable
 
 @dataclass(frozen=True)
 class ReconstructState:
-    """What is stored of ``geogs reconstruct``."""
+    """Checkpoint record of ``geogs reconstruct``."""
 
     made_from: str
     """Fingerprint of settings and images."""
@@ -22,14 +22,14 @@ class ReconstructState:
 
 
 def fingerprint(config: ReconstructConfig, hold_out: int | None, images: Sequence[str]) -> str:
-    """Sixteen digits that change with any setting of the map and with the names of its images."""
+    """Sixteen digits that depend on the settings of the map and the names of its images."""
     parts = (config.seed, asdict(config.input), asdict(config.search), asdict(config.mapping))
     text = json.dumps([*parts, hold_out, list(images)], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def read_work(output: Path, made_from: str) -> ReconstructionTable:
-    """What was written into the results with the same fingerprint.
+    """Read the work of a checkpoint with the same fingerprint.
 
     Raises:
         InputError: there is nothing, it is damaged, or made from other settings or images.

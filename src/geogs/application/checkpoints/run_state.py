@@ -21,7 +21,7 @@ from geogs.world.world import World
 
 @dataclass(frozen=True)
 class RunMetadata:
-    """What a run is made of, beside its state."""
+    """Settings and inputs of a run, beside its state."""
 
     settings: RunSettings
     """Settings with absolute paths."""
@@ -30,30 +30,30 @@ class RunMetadata:
     fingerprint: str
     """Fingerprint of the source."""
     calibration: Calibration | None
-    """Found before the run; none if the source's own was taken."""
+    """Calibration estimated before the run; none if the source's own was used."""
     place: ReadingPlace = field(default_factory=ReadingPlace)
-    """How far the source has been read."""
+    """Reading position in the source."""
     shutter: Shutter = field(default_factory=Shutter)
-    """Given, or found before the run."""
+    """Shutter, given or estimated before the run."""
 
 
 @dataclass(frozen=True)
 class RunState:
-    """What is stored of ``geogs run``."""
+    """Checkpoint record of ``geogs run``."""
 
     metadata: RunMetadata
     world: World
 
 
 def run_state(metadata: RunMetadata, slam: Slam, source: Source) -> RunState | None:
-    """What a checkpoint holds of a run as it is now; none before a map has been started."""
+    """The present checkpoint record of a run; none before a map has been started."""
     if not slam.segments.keyframe_ids:
         return None
     return RunState(replace(metadata, place=source.place), slam.settled())
 
 
 class SavedRun:
-    """A run's checkpoint to go on from."""
+    """A run's checkpoint to resume from."""
 
     def __init__(self, output: Path) -> None:
         """Raises InputError if there is none, it is damaged, or another version wrote it."""
@@ -61,23 +61,23 @@ class SavedRun:
         self.metadata: RunMetadata = self._saved.plain("metadata")
         with self._saved.in_a_sentence():
             self.settings = self._trusted(output)
-            """Settings that the run was begun with, without files that only a stranger names."""
+            """Settings of the run; an untrusted checkpoint's files elsewhere are left out."""
 
     def _trusted(self, output: Path) -> RunSettings:
         begun = self.metadata.settings
-        if any(map(live_address, begun.source)):  # of which there is no checkpoint
+        if any(map(live_address, begun.source)):  # such runs write no checkpoint
             raise InputError("it names a live source, which cannot be gone on with")
         return begun if self._saved.is_own else without_files_outside(begun, output)
 
     @contextmanager
     def world(self, device: torch.device) -> Iterator[World]:
-        """What the run knew; making a system of it may raise InputError, in a sentence."""
+        """Restore the run's world; building a system in the block may raise InputError."""
         world = self._saved.work("world", device)
         with self._saved.in_a_sentence():
             yield world
 
     def calibrated(self, source: Source) -> Source:
-        """The source as the run read it. Raises InputError if its files are not what they were."""
+        """The source with the run's calibration. Raises InputError if its files have changed."""
         if source.fingerprint() != self.metadata.fingerprint:
             raise InputError(
                 f"{source.name} is not what it was when the run began (other files, or other "

@@ -1,8 +1,8 @@
-"""Seals: by which a checkpoint is known as one that this user made with this cache folder.
+"""Seals of checkpoints: proof that this user made them with this cache folder.
 
-A seal is an HMAC-SHA256 by a key of 32 random bytes that is in the user's cache folder alone. Who
-cannot read the key cannot make one; a checkpoint without its seal is nobody's in particular, and
-used like any file of a stranger.
+A seal is an HMAC-SHA256 by a key of 32 random bytes that is in the user's cache folder alone. No
+seal can be made without the key; a checkpoint without a valid seal is used like any untrusted
+file.
 """
 
 import hmac
@@ -52,7 +52,7 @@ def _key() -> bytes | None:
 
 
 def _new_key() -> bytes | None:
-    """A key, kept from now on; that of another process that was faster; none if none can be."""
+    """Make and store a key, or take that of a faster process; none if it cannot be stored."""
     path = _path()
     unfinished = path.with_name(f"{path.name}.{secrets.token_hex(8)}")
     with suppress(OSError):
@@ -61,7 +61,7 @@ def _new_key() -> bytes | None:
         with os.fdopen(os.open(unfinished, flags, 0o600), "wb") as stream:
             stream.write(secrets.token_bytes(_BYTES))
         with suppress(FileExistsError):
-            os.link(unfinished, path)  # whole or not at all, and never over another
+            os.link(unfinished, path)  # atomic, and never over another key
     with suppress(OSError):
         unfinished.unlink()
     return _key()

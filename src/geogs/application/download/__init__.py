@@ -1,1 +1,1 @@
-"""Public sequences: which are known, fetched with resumption, unpacked safely."""
+"""Public sequences: a catalogue, download with resumption, safe unpacking."""

@@ -11,12 +11,12 @@ from geogs.application.results.output_folder import claimed
 
 
 def download(sequence: PublicSequence, into: Path, progress: RunProgress | None = None) -> Path:
-    """Fetch a sequence into ``into``; the folder with it. What was begun earlier is gone on with.
+    """Fetch a sequence into ``into``, or resume an earlier attempt. Returns its folder.
 
     The archive is deleted once its files are there.
 
     Raises:
-        InputError: it cannot be fetched, or is not what it should be.
+        InputError: it cannot be fetched, or is damaged.
         OutputError: a file cannot be written.
     """
     progress = progress or RunProgress()

@@ -1,4 +1,4 @@
-"""A file over HTTP, gone on with where an earlier attempt ended."""
+"""Download over HTTP, resumed where an earlier attempt ended."""
 
 import hashlib
 import http.client
@@ -12,13 +12,13 @@ from geogs.errors import InputError, OutputError
 
 _CHUNK = 1 << 20
 _TIMEOUT = 30.0
-"""Seconds without a byte."""
+"""Timeout in seconds without a byte."""
 
 Report = Callable[[float], None]
 
 
 class _OnlyHttp(urllib.request.HTTPRedirectHandler):
-    """Follows no redirection to what is not HTTP, nor from HTTPS to what is not encrypted."""
+    """Refuses redirections away from HTTP, and from HTTPS to an unencrypted address."""
 
     def redirect_request(self, req, fp, code, msg, headers, newurl):  # type: ignore[no-untyped-def]
         allowed = ("https://",) if req.full_url.startswith("https://") else ("https://", "http://")
@@ -28,16 +28,16 @@ class _OnlyHttp(urllib.request.HTTPRedirectHandler):
 
 
 def fetch(url: str, path: Path, sha256: str, report: Report) -> None:
-    """Put the file at an address into ``path``; ``path.part`` is what there is of it meanwhile.
+    """Download a file to ``path``; ``path.part`` is the incomplete file.
 
     Args:
-        url: of the file.
+        url: address of the file.
         path: where to put it.
-        sha256: that it must have; empty where it is not known.
-        report: told which part of it is there, in [0, 1].
+        sha256: expected checksum; empty where it is not known.
+        report: called with the received fraction, in [0, 1].
 
     Raises:
-        InputError: the server cannot be reached, has no such file, or it is not as it should be.
+        InputError: the server cannot be reached, has no such file, or the file is damaged.
         OutputError: it cannot be written.
     """
     part = path.with_name(f"{path.name}.part")
@@ -62,7 +62,7 @@ def fetch(url: str, path: Path, sha256: str, report: Report) -> None:
 
 
 def _received(url: str, part: Path, report: Report) -> int | None:
-    """Add what is missing; returns how many bytes the server says that the file has."""
+    """Append the missing bytes. Returns the file size given by the server."""
     there = part.stat().st_size if part.is_file() else 0
     request = urllib.request.Request(url, headers={"User-Agent": "geogs"})
     if there:

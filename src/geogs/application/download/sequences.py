@@ -1,8 +1,7 @@
-"""Public sequences that can be fetched without an account, their places and licences.
+"""Public sequences that can be fetched without an account, their addresses and licences.
 
-What servers hold was not published with checksums: a file is compared with the size that its server
-says, and archives with the checksums that they carry inside. Where the maker publishes a SHA-256 it
-belongs here.
+The files were not published with checksums: a file is compared with the size given by its server,
+and archives with the checksums inside them. Where the maker publishes a SHA-256 it belongs here.
 """
 
 import difflib
@@ -21,7 +20,7 @@ class PublicFile:
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the file."""
         return self.url.rsplit("/", 1)[-1]
 
 
@@ -32,13 +31,13 @@ class PublicSequence:
     name: str
     """Name on the command line."""
     folder: str
-    """What its folder is called: by it the camera of some is known."""
+    """Name of its folder, which identifies the camera of some sequences."""
     archive: PublicFile
     licence: str
     page: str
-    """Where its makers tell of it, and what to cite."""
+    """Web page of the data set, with the citation."""
     beside: tuple[PublicFile, ...] = ()
-    """Files that belong into its folder and are not in the archive, such as true poses."""
+    """Files for its folder that are not in the archive, such as true poses."""
 
 
 _TUM = "https://cvg.cit.tum.de/rgbd/dataset"

@@ -1,4 +1,4 @@
-"""Archives of images unpacked: plain files and folders inside one folder, and nothing else."""
+"""Safe unpacking of image archives: only plain files and folders inside one folder."""
 
 import shutil
 import tarfile
@@ -13,16 +13,16 @@ from typing import IO
 from geogs.errors import InputError, OutputError
 
 _MAX_RATIO = 50
-"""Largest size of its files, in sizes of the archive: images hardly shrink."""
+"""Largest ratio of unpacked to archive size: images hardly shrink."""
 _MIN_LIMIT = 1 << 30
-"""Bytes that are let pass in any case."""
+"""Unpacked size in bytes that is always allowed."""
 
 Member = tuple[str, int, Callable[[], IO[bytes] | None]]
-"""Name, bytes, and how a plain file of an archive is opened."""
+"""Name, size in bytes, and opener of a plain file in an archive."""
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack a ``.zip`` or a tar file into a new folder, without a folder that all of it is in.
+    """Unpack a ``.zip`` or a tar file into a new folder, without a common top folder.
 
     Raises:
         InputError: it is damaged, or holds links, devices, or names that lead out of the folder.
@@ -39,14 +39,14 @@ def unpack(archive: Path, folder: Path) -> None:
     except (tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise InputError(f"{archive} is damaged ({error}); delete it and fetch it again.") from None
     except OSError as error:
-        if error.strerror is None:  # what gzip says of a damaged file
+        if error.strerror is None:  # gzip's error for a damaged file
             raise InputError(f"{archive} is damaged; delete it and fetch it again.") from None
         raise OutputError(f"{folder} cannot be written ({error.strerror}).") from None
     _lift(folder)
 
 
 def _members(archive: Path) -> Iterator[Member]:
-    """The plain files. Raises InputError for what is neither a file nor a folder."""
+    """The plain files. Raises InputError for anything but files and folders."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as packed:
             for entry in packed.infolist():
@@ -82,7 +82,7 @@ def _write(path: Path, opened: Callable[[], IO[bytes] | None]) -> None:
 
 
 def _lift(folder: Path) -> None:
-    """Let the only folder inside take the place of the folder, if all lies in it."""
+    """Replace the folder by its only sub-folder, if all lies in that."""
     inside = list(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir():
         own = inside[0].rename(folder.with_name(f"{folder.name}.inner"))

@@ -28,7 +28,7 @@ from geogs.mesh.triangle_mesh import median_edge
 from geogs.threads import on_one_torch_thread
 
 TOLERANCE = 2.0
-"""Median edges of the mesh that a face may lie off a depth map that shows it."""
+"""Largest distance of a face from a depth map that shows it, in median mesh edges."""
 _FILES: dict[Format, tuple[str, ...]] = {
     "cloud": ("cloud.ply", ".ply", ".las"),
     "euroc": ("data.csv", ".csv"),
@@ -38,14 +38,14 @@ _FILES: dict[Format, tuple[str, ...]] = {
     "obj": ("mesh.obj", ".obj"),
     "tum": ("trajectory.txt", ".txt", ".tum"),
 }
-"""Formats of a single file: its usual name, and how it may end."""
+"""Formats of a single file: its default name, and the allowed endings."""
 _SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
-"""Endings of files; a folder is not named so."""
+"""Endings of files; a folder has none of these."""
 
 
 @on_one_torch_thread
 def export(settings: ExportSettings) -> Path:
-    """Write a result in another format; the folder or file.
+    """Write a result in another format. Returns the folder or file.
 
     Raises:
         InputError: there is no result, it is too old, or lacks what the format needs.
@@ -61,7 +61,7 @@ def export(settings: ExportSettings) -> Path:
     if path == settings.output and to in _FILES and to != "kitti":  # of two files
         _write(path, result, settings)
         return path
-    # Nothing below the folder that the user named, or that of the result, is believed to be there.
+    # Existing content of the user's folder, or of the result's, is not trusted.
     folder = result.folder if settings.output is None else path if to not in _FILES else path.parent
     with claimed(folder) as output, replaced(output, "beside") as new:
         _write(new / path.relative_to(folder), result, settings)
@@ -96,10 +96,10 @@ def _write(path: Path, result: SavedResult, settings: ExportSettings) -> None:
 
 
 def _file(place: Path, name: str, *suffixes: str) -> Path:
-    """The place if it is named like a file of that kind, else the usual name in it.
+    """The path if it is named like a file of that format, else the default name in it.
 
     Raises:
-        InputError: it is named like a file of another kind.
+        InputError: it is named like a file of another format.
     """
     if place.suffix.lower() in _SUFFIXES - {*suffixes}:
         raise InputError(f"{place} should end in {' or '.join(suffixes)}, or be a folder.")
@@ -107,7 +107,7 @@ def _file(place: Path, name: str, *suffixes: str) -> Path:
 
 
 def _disk_colours(result: SavedResult) -> Float[np.ndarray, "n 3"]:
-    """RGB in [0, 1] of the disks; raises InputError if there are no images to take it from."""
+    """RGB in [0, 1] of the disks. Raises InputError if the result has no images."""
     result.require_images()
     return splat_colours(result.disks, fusion_views(result.keyframes))
 
@@ -122,7 +122,7 @@ def _write_cloud(path: Path, result: SavedResult) -> None:
 
 
 def _write_mesh(path: Path, result: SavedResult, settings: ExportSettings) -> None:
-    """Write the mesh of the result as it is, or with the keyframes' images put together on it."""
+    """Write the mesh of the result unchanged, or textured by the keyframes' images."""
     mesh = result.mesh
     if mesh is None:
         raise InputError(f"{result.folder} has no mesh.ply; geogs mesh {result.folder} makes it.")

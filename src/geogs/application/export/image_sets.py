@@ -26,7 +26,7 @@ from geogs.io.writers.ply_writer import write_points
 
 
 def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bool) -> None:
-    """``images/``, ``masks/`` and ``sparse/0/`` with about so many points and their tracks.
+    """Write ``images/``, ``masks/`` and ``sparse/0/`` with about ``points`` points and tracks.
 
     Raises:
         InputError: the result has no images, or shows no surface.
@@ -42,7 +42,7 @@ def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bo
 
 
 def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None:
-    """``transforms.json``, start points, and images with depth, normals and masks of their size.
+    """Write ``transforms.json``, start points, images, and depth, normals and masks of their size.
 
     Raises:
         InputError: the result has no images, or shows no surface.
@@ -66,7 +66,7 @@ def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None
 
 
 def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "normals"]) -> None:
-    """A PNG and an NPZ for every keyframe, of the size of its image, and ``description.json``.
+    """Write a PNG and an NPZ of image size for every keyframe, and ``description.json``.
 
     Raises:
         OutputError: a file cannot be written.
@@ -96,13 +96,13 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
 
 
 def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:
-    """Copy the images as they are kept; what they are called, and where they were taken."""
+    """Copy the stored images. Returns their names and poses."""
     views = result.views
     result.require_images()
     images = []
     for number, (id, T_cw) in enumerate(zip(views.keyframe_id.tolist(), views.T_cw, strict=True)):
         kept = image_path(result.folder, id)
-        result.image(number)  # a picture, wherever a link leads
+        result.image(number)  # checks that it is a picture, even through a link
         with atomic_file(folder / "images" / kept.name) as stream:
             stream.write(read_bytes(kept))
         images.append(ExportedImage(kept.name, T_cw))
@@ -124,6 +124,6 @@ def _farthest(result: SavedResult) -> float:
 
 
 def _nerfstudio_unit(result: SavedResult) -> float:
-    """nerfstudio's own unit of depth where that has enough steps, and reaches far enough."""
+    """nerfstudio's default unit of depth where its resolution and range suffice."""
     farthest = _farthest(result)
     return DEPTH_UNIT if 0.5 < farthest < DEPTH_UNIT * STEPS else depth_unit(farthest)

@@ -14,7 +14,7 @@ from geogs.io.writers.exports.exported import SeenPoints
 from geogs.types import RenderedKeyframe
 
 AGREEMENT = 0.01
-"""Relative difference of depths up to which a keyframe sees a point."""
+"""Largest relative difference of depth for a keyframe to see a point."""
 _MIN_COSINE = 0.1
 
 
@@ -22,7 +22,7 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
     """About ``count`` points from the keyframes' depths that two keyframes or more see.
 
     A keyframe sees a point that projects onto its depth map within 1 % of the depth there and faces
-    it. ``camera`` is that of the images, in whose pixels observations are.
+    it. ``camera`` is that of the images; observations are in its pixels.
 
     Raises:
         InputError: a keyframe has no image, or no two of them see the same surface.
@@ -48,9 +48,9 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
 
 
 def cloud(keyframes: Sequence[RenderedKeyframe]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, normals and colours of the surface that all confident depths show.
+    """Point cloud of all confident depths: positions, normals and colours.
 
-    Of the points in a cube with edges of a pixel at the median depth one is kept.
+    One point is kept per voxel, whose edge is the size of a pixel at the median depth.
 
     Raises:
         InputError: there is no depth, or a keyframe has no image.
@@ -109,7 +109,7 @@ def _lifted(
 def _observed(
     positions: Float64[np.ndarray, "n 3"], normals: np.ndarray, keyframe: RenderedKeyframe
 ) -> tuple[Int64[np.ndarray, "k"], Float64[np.ndarray, "k 2"]]:
-    """Points that a keyframe sees, and where in its depth map."""
+    """Indices of the points that a keyframe sees, and their pixels in its depth map."""
     camera, T_cw = keyframe.camera, keyframe.T_cw
     points = transform(T_cw, torch.from_numpy(positions))
     pixels, z = camera.project(points)

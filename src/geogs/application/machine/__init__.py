@@ -1,1 +1,1 @@
-"""The machine: what a run computes on, and whether it works."""
+"""The machine: compute devices, compilation and self-tests."""

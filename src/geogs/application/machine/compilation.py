@@ -1,7 +1,7 @@
-"""Kernels for the CPU, compiled once on a machine, by other processes while the first images come.
+"""Kernels for the CPU, compiled once per machine, by other processes while a run starts.
 
 ``python -m geogs.application.machine.compilation`` compiles them at once. Numba keeps them where
-:mod:`geogs.kernel_folder` says; files beside them tell of what they are.
+:mod:`geogs.kernel_folder` says; files beside them record the versions they were made of.
 """
 
 import contextlib
@@ -22,36 +22,36 @@ from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
 PARTS = "search", "train", "mesh"
-"""What is compiled side by side; what is needed first goes first."""
+"""Parts that are compiled in parallel, in the order in which they are needed."""
 ON_GPU = "planes", "turn", "lens"
-"""The same where a GPU does the rest; what takes longest goes first."""
+"""Parts for a run on a GPU, those that take longest first."""
 POSED_ON_GPU = "look", "planes"
-"""The same where poses are known, too."""
+"""Parts for known poses on a GPU."""
 _NICENESS = 5
-"""Added to the niceness of each part over what goes before it, images first of all."""
+"""Increment of niceness from each part to the next; the run itself comes first."""
 _POLL_SECONDS = 0.05
 _OBJECTS = 100_000
-"""New objects after which Python looks for garbage; a compiler makes many that stay."""
+"""Threshold of garbage collection, in new objects; a compiler makes many that stay."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 
 
 class Compilation:
-    """What other processes compile, each a part; nothing where all is there."""
+    """Compilation in other processes, one for each part; none where all is compiled."""
 
     def __init__(self, parts: "Mapping[str, subprocess.Popen[str]] | None" = None) -> None:
-        """Processes by their parts, in the order in which these are needed."""
+        """``parts`` are processes by part, in the order in which these are needed."""
         self._processes = parts or {}
 
     @property
     def is_working(self) -> bool:
-        """Whether something has still to be compiled."""
+        """Whether a process still compiles."""
         return any(process.poll() is None for process in self._processes.values())
 
     def wait(self, report: StageProgress, last: str | None = None) -> float:
-        """Until all is compiled, or the parts up to the ``last`` that is needed, if that is among
-        them; how many seconds that took from now on.
+        """Wait until all is compiled, or, if ``last`` is one of the parts, those up to it. Returns
+        the seconds waited.
 
-        What ``report`` raises ends it early; what has failed is compiled when it is used.
+        An exception of ``report`` ends it early; failed parts are compiled when they are used.
         """
         start = time.perf_counter()
         names = [*self._processes]
@@ -72,7 +72,7 @@ class Compilation:
 
 @contextmanager
 def compiling(device: torch.device, knows_poses: bool = False) -> Iterator[Compilation]:
-    """Inside, what a command needs of the CPU is compiled beside it, if it is not."""
+    """Compile the CPU kernels of a command in the background of the block, where missing."""
     on_gpu = POSED_ON_GPU if knows_poses else ON_GPU
     parts = PARTS if device.type == "cpu" else on_gpu
     if is_compiled(parts) or not sys.executable:
@@ -91,14 +91,14 @@ def compiling(device: torch.device, knows_poses: bool = False) -> Iterator[Compi
 
 
 def is_compiled(parts: Iterable[str] = PARTS) -> bool:
-    """Whether the kernels that are there were made by this version for this processor."""
+    """Whether the stored kernels are complete, and of this version and processor."""
     with contextlib.suppress(OSError):
         return all(_record(part).read_text() == _made_of() for part in parts)
     return False
 
 
 def compile_now(parts: Iterable[str] = PARTS) -> None:
-    """Compile what is not, and keep a record of it."""
+    """Compile missing kernels, and write a record."""
     from geogs.application.machine.rehearsal import rehearse
 
     for part in parts:
@@ -114,7 +114,7 @@ def _record(part: str) -> Path:
 
 
 def _made_of() -> str:
-    """What numba compiles anew where it changes."""
+    """Versions, processor and sources; numba recompiles where these change."""
     from llvmlite.binding import get_host_cpu_name
 
     files = sorted(path for pattern in _SOURCES for path in PACKAGE.glob(pattern))
@@ -124,9 +124,9 @@ def _made_of() -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Compile all, or the parts that are named."""
+    """Compile all parts, or the named ones."""
     parts = arguments or [*PARTS]
-    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # nobody reads them
+    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # messages are not shown
     gc.freeze()
     gc.set_threshold(_OBJECTS)
     with contextlib.suppress(AttributeError, OSError):

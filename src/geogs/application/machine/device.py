@@ -1,4 +1,4 @@
-"""What a run computes on: the device made ready, and the memory that is used."""
+"""The compute device: kernels, errors and memory use."""
 
 import sys
 import time
@@ -16,13 +16,13 @@ from geogs.gpu.kernels import prepare_kernels
 REMEDY = (
     "use fewer images (--stride), a smaller --long-edge, a GPU with more memory, or --device cpu"
 )
-"""What helps where the memory of a GPU is full."""
+"""Remedy for a full GPU memory."""
 
 _GPU_FAILS = ("CUDA error", "CUDA driver error", "cuDNN error", "cuBLAS", "CUBLAS", "NVRTC")
 
 
 def compile_gpu_kernels(device: torch.device) -> float:
-    """Have all kernels of a GPU compiled, once per machine; the seconds that took."""
+    """Compile all kernels of a GPU, once per machine. Returns the seconds it took."""
     start = time.perf_counter()
     if device.type == "cuda":
         prepare_kernels(PACKAGE, device)
@@ -31,10 +31,10 @@ def compile_gpu_kernels(device: torch.device) -> float:
 
 @contextmanager
 def gpu_errors_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]:
-    """Inside, errors of a GPU that fails or is full become a DeviceError with the remedy.
+    """Turn errors of a GPU that fails or is full into a DeviceError with the remedy.
 
-    ``way_on`` gives a sentence on how to go on with the work, behind a space, or nothing; a second
-    Ctrl-C says it, too. Where one such block is in another, the inner one says the way.
+    ``way_on`` gives a sentence on how to resume, after a space, or nothing; a second Ctrl-C reports
+    it, too. Of nested blocks, the inner one gives the sentence.
     """
     try:
         yield
@@ -50,15 +50,15 @@ def gpu_errors_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]:
 
 
 def is_gpu_failure(error: Exception) -> bool:
-    """Whether an error came from a GPU that fails or is full, not from what was computed on it."""
+    """Whether an error came from a GPU that fails or is full, not from the computation."""
     if isinstance(error, torch.cuda.OutOfMemoryError):
         return True
-    # Of a class of its own in some versions of PyTorch only.
+    # Only some versions of PyTorch have a class for it.
     return isinstance(error, RuntimeError) and any(w in in_short(error) for w in _GPU_FAILS)
 
 
 def device_summary(device: torch.device) -> dict[str, object]:
-    """What the map was trained on, and a GPU's memory at its fullest (PyTorch's tensors)."""
+    """Name of the device, and peak GPU memory (PyTorch's tensors)."""
     if device.type != "cuda":
         return {"device": "cpu"}
     name = torch.cuda.get_device_name(device)
@@ -69,7 +69,7 @@ def peak_memory() -> int:
     """Largest resident size of this process so far, bytes."""
     import resource
 
-    try:  # of this program alone: what the system counts begins with the size of who started it
+    try:  # of this program alone: getrusage includes the size of the parent process
         status = Path("/proc/self/status").read_text()
     except OSError:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,4 +1,4 @@
-"""What this machine can do, and what to mend."""
+"""Diagnosis of this machine: versions, GPUs, kernels, and problems to fix."""
 
 import platform
 import sys
@@ -29,15 +29,15 @@ class Finding:
     name: str
     text: str
     problem: str | None = None
-    """A sentence on what to mend, if anything."""
+    """A sentence with the problem and its remedy, if any."""
     is_fatal: bool = False
-    """Whether nothing works before it is mended."""
+    """Whether nothing works before it is fixed."""
 
 
 def examine(device_name: str = "auto") -> Iterator[Finding]:
-    """Every finding as soon as it is made.
+    """Yield every finding as soon as it is made.
 
-    Raises DeviceError if a device is asked for by name that cannot be used.
+    Raises DeviceError if the named device cannot be used.
     """
     yield from _versions()
     device = installation.require_device(device_name)
@@ -75,7 +75,7 @@ def _versions() -> Iterator[Finding]:
 
 
 def _bytecode() -> Finding:
-    """Whether Python keeps what it compiles of the largest library that every command loads."""
+    """Whether Python keeps bytecode of PyTorch, the largest library that every command loads."""
     if Path(cache_from_source(str(torch.__file__))).exists():
         return Finding("bytecode", "kept")
     return Finding(
@@ -90,7 +90,7 @@ def _bytecode() -> Finding:
 def _gpus() -> Iterator[Finding]:
     """Every GPU and the driver; or why there is none.
 
-    A machine without a driver has nothing to mend.
+    A machine without a driver has no problem.
     """
     supported = installation.driver_cuda()
     if problem := installation.gpu_problem():
@@ -105,7 +105,7 @@ def _gpus() -> Iterator[Finding]:
 
 
 def _binaries() -> Finding:
-    """Which kernels for GPUs came compiled; those of a clone are compiled at their first use."""
+    """GPU kernels shipped as binaries; those of a clone are compiled at their first use."""
     sources = kernel_sources(PACKAGE)
     came = [a for a, n in binaries.shipped_sources(sources).items() if n == len(sources)]
     text = f"of all {len(sources)} sources for {', '.join(came)}" if came else "none came along"
@@ -128,7 +128,7 @@ def _cache(is_needed: bool) -> Finding:
 
 
 def _weights() -> Finding:
-    """The weights files that are there."""
+    """The weights files found, and their checksums."""
     found = {known: checksum(path) for known in CATALOGUE if (path := locate(known))}
     text = ", ".join(f"{k.name} ({k.purpose}: {c.verdict})" for k, c in found.items())
     wrong = [k.name for k, c in found.items() if c.is_wrong]
@@ -157,7 +157,7 @@ def _kernels(device: torch.device) -> Finding:
 
 
 def _cpu_kernels() -> Finding:
-    """What is compiled for the CPU, by numba, from its cache or now."""
+    """CPU kernels of numba, from its cache or compiled now."""
     start = time.perf_counter()
     is_there = compilation.is_compiled()
     if not is_there:
@@ -178,7 +178,7 @@ def _self_test(device: torch.device) -> Iterator[Finding]:
         yield Finding("self-test", f"{name}: relative error {errors}  OK")
         repeats = 20 if device.type == "cuda" else 3
         milliseconds = time_renderer(device, repeats=repeats)
-    except Exception as error:  # whatever is wrong here is what the user wants to know
+    except Exception as error:  # any failure is to be reported
         problem = f"The renderer does not run on {device} ({_first_line(error)})."
         yield Finding("self-test", f"{name}: BAD", problem, is_fatal=True)
         return

@@ -1,4 +1,4 @@
-"""All that is compiled for the CPU at first use, used once: a map and its mesh of a tiny wall."""
+"""Warm-up that compiles all CPU kernels: a map and a mesh of a tiny wall."""
 
 from dataclasses import replace
 
@@ -33,30 +33,30 @@ from geogs.world.grid import SampleGrid
 
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 VIEWS, SHIFT = 6, 8
-"""Pictures of the wall, and pixels from one to the next."""
+"""Number of pictures of the wall, and shift between two in pixels."""
 BASELINE = 0.3
-"""Between neighbouring cameras, of which each looks straight at the wall."""
+"""Distance between neighbouring cameras, which look straight at the wall."""
 DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """Leaves nothing. ``search`` follows the wall on a CPU and searches its depths, ``train``
-    trains its map, ``mesh`` extracts its mesh; ``look``, ``planes``, ``turn`` and ``lens`` do what
-    no GPU does."""
+    """Use the kernels of a part. ``search`` tracks the wall on a CPU and searches its depths,
+    ``train`` trains its map, ``mesh`` extracts its mesh; ``look``, ``planes``, ``turn`` and
+    ``lens`` are the steps that never run on a GPU."""
     for step in _STEPS[part]:
         step()
 
 
 def _look() -> None:
-    """A first look at the wall from known poses."""
+    """Find first points of the wall from known poses."""
     poses = [ViewPose(number, _pose(number)) for number in range(VIEWS)]
     pictures = _pictures()
     first_points(poses, lambda number: (pictures[number], None), CAMERA, lambda done: None)
 
 
 def _turn() -> None:
-    """The turning between two pictures, as for the rows of a rolling shutter."""
+    """Estimate the rotation between two pictures, as for the rows of a rolling shutter."""
     meter = FlowMeter(RollingCamera(CAMERA))
     first, second, *_ = map(meter.small, _pictures())
     angular_velocity(meter.measure(first, second), 1.0, 0.1)
@@ -64,13 +64,13 @@ def _turn() -> None:
 
 
 def _recognise() -> None:
-    """Two pictures held together by their features."""
+    """Match two pictures by their features."""
     first, second, *_ = map(orb_features, _pictures())
     TwoViewVerifier(CAMERA).verify(FeatureView(first), FeatureView(second))
 
 
 def _follow() -> None:
-    """A picture found again where it is expected."""
+    """Measure flow from a picture to itself."""
     operator = ClassicalFlow(SampleGrid(CAMERA))
     image = operator.encode(_pictures()[0])
     here = operator.grid.pixels[None]
@@ -78,7 +78,7 @@ def _follow() -> None:
 
 
 def _lens() -> None:
-    """Two pictures through a lens that nobody knows, and rows that were read in turn."""
+    """Adjust two pictures with an unknown lens, and a rolling shutter."""
     grid, times = SampleGrid(CAMERA), np.arange(VIEWS) / 30
     T_cw = torch.stack([torch.from_numpy(_pose(number)) for number in range(VIEWS)])
     depth, free = torch.full((2, grid.size), 1 / DEPTH), torch.tensor([False, True])
@@ -95,7 +95,7 @@ def _lens() -> None:
 
 
 def _search() -> None:
-    """Depths of the wall, which check each other."""
+    """Search depths of the wall, and check them against each other."""
     mapper = _scene().mapper
     points = DEPTH * CAMERA.rays(torch.float64).numpy()[::4, ::4].reshape(-1, 3)
     expect_depths(mapper.views.values(), points, mapper.cameras.working)
@@ -104,7 +104,7 @@ def _search() -> None:
 
 
 def _train() -> None:
-    """A map of the wall from depths that are known."""
+    """Train a map of the wall from known depths."""
     scene = _scene()
     mapper = scene.mapper
     size = mapper.cameras.render.height, mapper.cameras.render.width
@@ -127,7 +127,7 @@ def _scene() -> Reconstruction:
 
 
 def _bare() -> None:
-    """A bare part of the wall, of which only the rim is known; its depth is laid on a plane."""
+    """Fill a textureless part of the wall by a plane, from the depth at its rim."""
     depth = np.full((CAMERA.height, CAMERA.width), DEPTH, np.float32)
     confidence, labels = np.ones_like(depth), np.zeros(depth.shape, np.int32)
     confidence[20:50, 20:70] = 0
@@ -151,7 +151,7 @@ _STEPS = {
 
 
 def _seen(number: int) -> DepthMapView:
-    """The wall as it is."""
+    """The true depth map of the wall."""
     depth = torch.full((CAMERA.height, CAMERA.width), DEPTH)
     pose, picture = torch.from_numpy(_pose(number)), _pictures()[number]
     return DepthMapView(depth, torch.ones_like(depth), CAMERA, pose, picture)
@@ -164,7 +164,7 @@ def _pose(number: int) -> Float[np.ndarray, "4 4"]:
 
 
 def _pictures() -> list[UInt8[np.ndarray, "h w 3"]]:
-    """The wall is parallel to all images, so each shows the next part of one texture."""
+    """Pictures of the wall, which is parallel to all images: shifted parts of one texture."""
     import cv2
 
     random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The renderer against its specification on this machine, and how fast it is."""
+"""Self-test of the renderer against its specification on this machine, and its speed."""
 
 import time
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class Agreement:
 
     @property
     def is_good(self) -> bool:
-        """Whether both are within what rounding explains; false for NaN."""
+        """Whether both are within the tolerances; false for NaN."""
         return self.maps < MAP_TOLERANCE and self.gradients < GRADIENT_TOLERANCE
 
 
@@ -108,7 +108,7 @@ class _Rendered:
     maps: Tensor
     """(..., 6): depth, normal, alpha, distortion."""
     leaves: list[Tensor]
-    """What the maps depend on: the disks' numbers and the pose."""
+    """Inputs of the maps: the disks' parameters and the pose."""
 
 
 def _render(scene: DiskParameters, camera: Camera, T_cw: Tensor, device: torch.device) -> _Rendered:

@@ -1,1 +1,1 @@
-"""How far a run is, what it says of it, and how long it still takes."""
+"""Progress of a run: its stages, messages and remaining time."""

@@ -1,4 +1,4 @@
-"""How a run tells what it is doing, to nobody unless somebody wants to know."""
+"""Interface for progress reports of a run."""
 
 from typing import TYPE_CHECKING
 
@@ -7,19 +7,19 @@ if TYPE_CHECKING:
 
 
 class RunProgress:
-    """Follows a run from outside; this one shows nothing. Override what you want to see."""
+    """Receives progress reports of a run; this one shows nothing. Override its methods."""
 
     def write(self, text: str) -> None:
-        """A sentence for the user; nothing if it is empty."""
+        """Show a sentence to the user; nothing if it is empty."""
 
     def expect(self, frames: int | None) -> None:
-        """Called before the first of so many frames, if known."""
+        """Called before the first frame, with the number of frames if known."""
 
     def frame(self, status: "PoseEstimate") -> None:
         """Called after each frame."""
 
     def dropped(self, frames: int) -> None:
-        """Called when more frames of a live source came too fast to be used; so many so far."""
+        """Called when frames of a live source were dropped, with their number so far."""
 
     def stage(self, name: str, fraction: float) -> None:
         """Called after each part of another stage; ``fraction`` in [0, 1]."""

@@ -1,4 +1,4 @@
-"""A run on the terminal: one line with how far a stage is and how long it takes; and a log."""
+"""Progress on the terminal: one line with the stage and its remaining time; and a log."""
 
 import logging
 import math
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from geogs.pose_estimate import PoseEstimate
 
 _LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
-"""Where no terminal redraws the line, one of text comes this often, and with ``-v`` this often."""
+"""Interval of text lines without a terminal, and with ``-v``."""
 
 _REDRAWS = 4
-"""A second; drawing the line holds the interpreter's lock for milliseconds."""
+"""Redraws per second; drawing the line holds the interpreter's lock for milliseconds."""
 
 _PACE_SECONDS = 60.0
-"""The rest of a stage is expected at the pace of this time: first parts often differ."""
+"""Window for the pace of a stage, in seconds: first parts often differ."""
 
 
 class TerminalProgress(RunProgress):
-    """A line on the standard error, while it is entered and from the first news on.
+    """A line on the standard error, while it is entered and from the first report on.
 
-    Without a terminal there is a line of text for every phase, and now and then within one.
+    Without a terminal there is a line of text for every phase, and at intervals within one.
     """
 
     def __init__(self, verbosity: Verbosity | None = None) -> None:
@@ -72,7 +72,7 @@ class TerminalProgress(RunProgress):
         trace: TracebackType | None,
     ) -> None:
         self.end_phase()
-        if self._bar.live.is_started:  # to stop what never began would print an empty line
+        if self._bar.live.is_started:  # stopping an unstarted bar would print an empty line
             self._bar.stop()
         if error is not None:
             self.note(f"ended by {kind.__name__ if kind else ''}: {error}")
@@ -82,7 +82,7 @@ class TerminalProgress(RunProgress):
                 self._log.close()
 
     def write(self, text: str) -> None:
-        """A line above the other, if there is something to say; warnings with ``-q``, too."""
+        """Print a line above the progress line, if it is not empty; with ``-q`` only warnings."""
         if not text:
             return
         self.note(text)
@@ -96,7 +96,7 @@ class TerminalProgress(RunProgress):
         self._enter("frames")
 
     def dropped(self, frames: int) -> None:
-        """Say so at the first of them; then they are counted in the line."""
+        """Warn at the first dropped frame; then show their number in the line."""
         if not self._dropped:
             self.write(
                 "warning: frames come faster than they are tracked, and some are dropped; a "
@@ -105,7 +105,7 @@ class TerminalProgress(RunProgress):
         self._dropped = frames
 
     def frame(self, status: "PoseEstimate") -> None:
-        """Move the line, with what there is to say beside it."""
+        """Update the line, with counts of keyframes, disks and memory."""
         done = None if self._frames is None else status.frames / max(self._frames, status.frames)
         parts = [f"{status.keyframes} keyframes"]
         if status.disks:  # else the map is made at the end
@@ -115,12 +115,12 @@ class TerminalProgress(RunProgress):
         info = "  ".join([*parts, self._memory_used()])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"
-        # Frames up to the first keyframes cost other than those after.
+        # Frames before the first keyframes take a different time.
         stage = "frames" if status.keyframes else "first frames"
         self._show(stage, f"frame {status.frames}/{self._frames or '?'}", info, done)
 
     def _memory_used(self) -> str:
-        """At the fullest so far; asked no more often than the line is drawn."""
+        """Peak memory so far; measured no more often than the line is drawn."""
         now = time.perf_counter()
         if now - self._measured > 1 / _REDRAWS:
             self._memory, self._measured = f"{peak_memory() / 2**30:.1f} GB", now
@@ -132,7 +132,7 @@ class TerminalProgress(RunProgress):
         self._show(name, name, "", fraction)
 
     def _enter(self, phase: str) -> None:
-        """Begin another phase, if it is another."""
+        """Begin a phase, unless it is the present one."""
         if phase == self._phase:
             return
         self.end_phase()
@@ -140,7 +140,7 @@ class TerminalProgress(RunProgress):
         self._printed = self._phase_began
 
     def end_phase(self) -> None:
-        """Say how long it took, where lines of text are wanted."""
+        """End the phase; its duration goes to the log, and to the terminal where text is shown."""
         if not self._phase:
             return
         seconds = time.perf_counter() - self._phase_began
@@ -151,7 +151,7 @@ class TerminalProgress(RunProgress):
             self._bar.console.print(text, soft_wrap=True, markup=False)
 
     def _show(self, stage: str, what: str, info: str, done: float | None) -> None:
-        """The line as it is now, or a line of text if it is time for one.
+        """Update the line, or print a line of text if it is time for one.
 
         ``done`` is the finished fraction of the stage; none where that is not known.
         """
@@ -179,14 +179,14 @@ class TerminalProgress(RunProgress):
             self._bar.console.print(text, soft_wrap=True, markup=False)
 
     def note(self, text: str) -> None:
-        """Lines for the log alone, if there is one."""
+        """Write lines to the log only, if there is one."""
         if self._log is not None:
             for line in text.splitlines():
                 self._log.handle(logging.makeLogRecord({"msg": line}))
 
 
 def _opened(path: Path) -> logging.Handler:
-    """A log to add to. Raises OutputError if it cannot be written."""
+    """Open a log for appending. Raises OutputError if it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         log = logging.FileHandler(path, encoding="utf-8")

@@ -1,1 +1,1 @@
-"""Results: what a run or a reconstruction came to, written to a folder and read from it."""
+"""Results of a run or a reconstruction, written to a folder and read from it."""

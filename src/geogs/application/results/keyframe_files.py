@@ -1,4 +1,4 @@
-"""What of its keyframes a result keeps, so that it can be used again."""
+"""Keyframe files of a result, which allow its further use."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,12 +29,12 @@ def write_keyframes(
     renders: Sequence[RenderedKeyframe],
     with_images: bool,
 ) -> MapViews:
-    """Write masks, images and rows as they were used to ``keyframes/``; all else is returned.
+    """Write masks, working images and rows to ``keyframes/``. Returns the other data.
 
     Args:
-        folder: of the result.
-        scene: whose map is seen.
-        camera: of the images.
+        folder: folder of the result.
+        scene: scene of the map.
+        camera: camera of the images.
         renders: the map seen from the keyframes.
         with_images: whether images and rows are written.
 

@@ -1,4 +1,4 @@
-"""What a result is written of: a run or a reconstruction, whichever made the map."""
+"""Source of a result: the run or the reconstruction that made the map."""
 
 from typing import TYPE_CHECKING
 

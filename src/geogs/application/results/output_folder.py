@@ -1,4 +1,4 @@
-"""The folder of a result: which is free, and who may write there."""
+"""The folder of a result: choice of a free one, and locks for writing."""
 
 import fcntl
 import os
@@ -14,12 +14,12 @@ from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.replacement import recover
 
 LOCK = ".geogs.lock"
-"""Name of the file that is locked."""
+"""Name of the lock file."""
 
 
 @contextmanager
 def only_writer(folder: Path) -> Iterator[None]:
-    """Inside, nobody else who asks likewise writes into a folder, where that can have locks.
+    """Lock a folder for one writer in the block, if its file system has locks.
 
     Raises:
         OutputError: another process writes there.
@@ -45,7 +45,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 
 def _is_locked(file: int, path: Path) -> bool:
-    """Whether the file is ours now, and still the one of that name."""
+    """Lock a file. Returns whether it is ours now, and still the one of that name."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -60,10 +60,10 @@ def _is_locked(file: int, path: Path) -> bool:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[Path]:
-    """The folder of a result, made where there is none; inside, nobody else writes there.
+    """Make and lock the folder of a result for the block.
 
-    What a command left there that was cut off is completed or undone. Folders that are made for it
-    go again where nothing came into them.
+    An interrupted write there is completed or undone. New folders are deleted again if they stay
+    empty.
 
     Raises:
         OutputError: it cannot be made or written, or another process writes there.
@@ -82,7 +82,7 @@ def claimed(folder: Path) -> Iterator[Path]:
 
 
 def free_folder(wanted: Path, fingerprint: str) -> Path:
-    """The folder, or the next of its name with a number that holds no result of another source.
+    """The folder, or the next with a number after its name, without a result of another source.
 
     ``fingerprint`` distinguishes sources of one name.
     """
@@ -94,7 +94,7 @@ def free_folder(wanted: Path, fingerprint: str) -> Path:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """What ``summary.json`` in a folder holds. Raises InputError if it is missing or damaged."""
+    """Read ``summary.json`` in a folder. Raises InputError if it is missing or damaged."""
     path = folder / "summary.json"
     summary = read_json(path)
     if not isinstance(summary, dict):
@@ -115,7 +115,7 @@ def _is_of_another(folder: Path, fingerprint: str) -> bool:
 
 
 def _begun_with(folder: Path) -> str | None:
-    """The source of an unfinished run; none where that is not known."""
+    """Fingerprint of an unfinished run's source; none where that is not known."""
     from geogs.application.checkpoints.run_state import SavedRun
 
     try:

@@ -1,4 +1,4 @@
-"""A first surface, from what tracking knows, while the map is still to be made."""
+"""Preview surface from the depths of tracking, before the map is made."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,19 +18,18 @@ from geogs.world.keyframes import Keyframe
 
 NAME = "preview.ply"
 _EDGE = 128
-"""Longer side of the depth maps, pixels: cells of the tracker are eight pixels of its images."""
+"""Longer side of the depth maps in pixels: a cell of the tracker has eight pixels."""
 _TRIANGLES = 60_000
 _MAX_VIEWS = 60
-"""Keyframes that are fused, evenly spread."""
+"""Largest number of fused keyframes, evenly spread."""
 _TWO_VIEWS = 1.5
-"""Weight that a voxel needs: so coarse a depth makes no surface alone."""
+"""Least weight of a voxel: one such coarse depth alone makes no surface."""
 
 
 def write_preview(output: Path, slam: Slam) -> bool:
-    """``preview.ply``: the surface of the depths by which the keyframes were tracked.
+    """Write ``preview.ply``: the surface of the depths of tracking.
 
-    It belongs to the result that is being made, and goes when that is written. Returns whether
-    there is one.
+    It is deleted when the final result is written. Returns whether there is one.
 
     Raises:
         OutputError: the file cannot be written.
@@ -45,7 +44,7 @@ def write_preview(output: Path, slam: Slam) -> bool:
 
 @on_one_torch_thread
 def preview(slam: Slam) -> Mesh | None:
-    """The surface of the depths of tracking, which know a cell in 64 pixels; none without any."""
+    """The surface of the depths of tracking, one per 64 pixels; none without any."""
     keyframes = slam.segments.main.segment.keyframes
     stride = -(-max(len(keyframes), 1) // _MAX_VIEWS)
     camera = slam.camera
@@ -55,7 +54,7 @@ def preview(slam: Slam) -> Mesh | None:
     rough = replace(slam.config.mesh, voxel=None, triangle_budget=_TRIANGLES, min_weight=_TWO_VIEWS)
     try:
         return extract_mesh(views, rough)
-    except InputError:  # too little is known for a surface; of all of it the map may have more
+    except InputError:  # too little surface is known; the full map may have more
         return None
 
 

@@ -1,4 +1,4 @@
-"""The mesh of a result, made anew from its folder without running again."""
+"""The mesh of a result, extracted again from its folder without another run."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from geogs.io.writers.replacement import replaced
 
 
 def mesh_settings(folder: Path) -> MeshConfig:
-    """The settings that the mesh of a result was made with; the defaults where nothing is said.
+    """Mesh settings of a result; the defaults where they are not stored.
 
     Raises:
         InputError: ``config.yaml`` is damaged, or holds a value that a setting cannot have.
@@ -34,13 +34,13 @@ def mesh_settings(folder: Path) -> MeshConfig:
 
 
 def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Path:
-    """Render the keyframes of a result, fuse their depths and write the mesh; the file's path.
+    """Render the keyframes of a result, fuse their depths and write the mesh. Returns its path.
 
-    Where that is the mesh of the result, its page is made anew, too, without what an evaluation
-    had said of the previous one.
+    If it is the mesh of the result, its page is made again, too, without the evaluation of the
+    previous one.
 
     On the CPU, with the settings of the run, the surface is that of the run to the last byte;
-    colours differ by what JPEG does to the images.
+    colours differ by the JPEG compression of the images.
 
     Raises:
         InputError: there is no result, it is too old, or its disks show no surface.

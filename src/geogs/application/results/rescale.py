@@ -1,4 +1,4 @@
-"""A result in metres by what is known of it afterwards, without running again."""
+"""Conversion of a result to metres by a known length, without another run."""
 
 import json
 import math
@@ -44,12 +44,12 @@ _STAGES = ("", "online/", "adjusted/")
 
 @on_one_torch_thread
 def rescale(settings: RescaleSettings) -> MetricScale:
-    """Find metres to the map unit, and write trajectories, map, meshes and summary in metres.
+    """Find metres per map unit, and write trajectories, map, meshes and summary in metres.
 
-    All take the places of the previous ones together. Earlier exports stay what they are.
+    All replace the previous ones together. Earlier exports do not change.
 
     Raises:
-        InputError: there is no result, nothing is known, or the result does not tell its scale.
+        InputError: there is no result, no length is given, or the scale cannot be determined.
         OutputError: a file cannot be written.
         DeviceError: the device cannot be used.
     """
@@ -71,7 +71,7 @@ def rescale(settings: RescaleSettings) -> MetricScale:
 
 
 def _factor(result: SavedResult) -> float:
-    """What lengths were multiplied by before. Raises InputError if the summary does not say."""
+    """Earlier factor on lengths. Raises InputError if the summary does not hold it."""
     before = result.summary.get("metric_scale")
     try:
         factor = 1.0 if before is None else float(before["factor"])
@@ -98,7 +98,7 @@ def _found(result: SavedResult, source: KnownLength) -> MetricScale:
 
 
 def _scale_files(new: Path, result: SavedResult, factor: float, summary: dict[str, Any]) -> None:
-    """All files of a result that hold lengths, multiplied."""
+    """Write all files of a result that hold lengths, scaled."""
     folder, disks = result.folder, result.disks
     world = replace(disks, position=factor * disks.position, scale=factor * disks.scale)
     colours = _splat_colours(folder / "splats.ply", len(disks))
@@ -121,13 +121,13 @@ def _scale_files(new: Path, result: SavedResult, factor: float, summary: dict[st
 
 
 def _scale_map(new: Path, result: SavedResult, world: MapSnapshot, factor: float) -> MapViews:
-    """``map.safetensors`` with the disks as they are in metres."""
+    """Write ``map.safetensors`` with the disks in metres."""
     views = result.views
     metadata = load_map_file(result.folder / "map.safetensors").metadata
     said = {k: v for k, v in metadata.items() if k != "views"}
     T_cw = views.T_cw.copy()
     T_cw[:, :3, 3] *= factor
-    # A map in the world's own frame stays in it; another keeps its digits in its own unit.
+    # A map in the world's own frame stays in it; another keeps its own unit, for precision.
     own = views.disks if views.origin.any() or views.unit != 1.0 else None
     moved = replace(
         views,
@@ -141,8 +141,8 @@ def _scale_map(new: Path, result: SavedResult, world: MapSnapshot, factor: float
 
 
 def _splat_colours(path: Path, count: int) -> np.ndarray | None:
-    """The colours of the splats; none where there are none. Raises InputError if they are not as
-    many as the disks, before anything has been changed."""
+    """The colours of the splats; none where there are none. Raises InputError if their number is
+    not that of the disks, before anything has been changed."""
     if not path.is_file():
         return None
     columns = read_ply(path)["vertex"].columns

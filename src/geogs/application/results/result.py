@@ -1,4 +1,4 @@
-"""What a run or a reconstruction came to."""
+"""The result of a run or a reconstruction, in memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """What there is of a scene; each part is made when it is first asked for, then kept."""
+    """The result for a scene; each part is computed at its first use, then kept."""
 
     scene: "MappedScene"
-    """A ``Slam`` or a ``Reconstruction``, whose work is done."""
+    """A finished ``Slam`` or ``Reconstruction``."""
     source: Source | PosedSource
-    """What it was made from, read to the end."""
+    """Its source, read to the end."""
     is_interrupted: bool = False
     """Whether the final stages were left out, or cut short."""
     progress: RunProgress = field(default_factory=RunProgress)
@@ -66,12 +66,12 @@ class Result:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """How well frames are known; none where the poses were given."""
+        """Standard deviations of the frames; none where the poses were given."""
         return self.scene.uncertainty()
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """Whether trajectory and shape are to be relied on; none where the poses were given."""
+        """Reliability of trajectory and shape; none where the poses were given."""
         if self.uncertainty is None:
             return None
         source = self.source
@@ -83,7 +83,7 @@ class Result:
 
     @property
     def why_no_map(self) -> str | None:
-        """Why no map could be started, where only orientations are known; else none."""
+        """Reason why no map could be started, where only orientations are known; else none."""
         reason = self.scene.statistics().get("not_started")
         return None if reason is None else str(reason)
 
@@ -99,8 +99,8 @@ class Result:
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The surface of the map; none where none was found, or where depths are no evidence of
-        one, which ``progress`` then says."""
+        """The surface of the map; none where none was found, or where depths are too uncertain,
+        which ``progress`` then reports."""
         if self.verdict is not None and not self.verdict.has_shape:
             self.progress.write("No mesh: nothing tells the depths of what was seen.")
             return None

@@ -1,4 +1,4 @@
-"""``report/``: the page of a result, with a model that turns; needs no ground truth."""
+"""``report/``: the page of a result, with an interactive model; needs no ground truth."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ from geogs.threads import ordered_map, worker_count
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 MAX_FACES, MAX_DISKS, MAX_IMAGES = 240_000, 50_000, 240
-"""Most of each on a page, which then has less than 8 MB."""
+"""Largest numbers of each on a page, which then has less than 8 MB."""
 IMAGE_BYTES = 1_500_000
-"""Bytes of all images of a page together, about."""
+"""Approximate size of all images of a page together in bytes."""
 _BYTES_A_PIXEL = 0.2
 _MAX_EDGE, _MIN_EDGE = 480, 128
 _QUALITY = 75
@@ -41,7 +41,7 @@ _QUALITY = 75
 
 @dataclass(frozen=True)
 class ShownView:
-    """A keyframe of the page, whose image is read when it is needed."""
+    """A keyframe of the page; its image is read on demand."""
 
     timestamp: float
     T_wc: Float[np.ndarray, "4 4"]
@@ -79,7 +79,7 @@ def write_page(
     summary: Mapping[str, object],
     disks: MapSnapshot | None = None,
 ) -> None:
-    """The page of a result whose pictures are in its folder.
+    """Write the page of a result whose pictures are in its folder.
 
     Raises:
         OutputError: a file cannot be written.
@@ -100,13 +100,12 @@ def write_page_anew(
     trajectory: Trajectory | None = None,
     summary: Mapping[str, Any] | None = None,
 ) -> None:
-    """The page of a result whose mesh is another now; where it has none, nothing.
+    """Write the page of a result again for a new mesh, if it has a page.
 
-    ``new`` is the folder of its new files. Trajectory and summary are those of the result where
-    none are given.
+    ``new`` is the folder of its new files. Trajectory and summary default to those of the result.
 
     Raises:
-        InputError: what it shows is damaged.
+        InputError: the result is damaged.
         OutputError: it cannot be written.
     """
     from geogs.evaluation.pages.run_page import write_run_page
@@ -123,7 +122,7 @@ def write_page_anew(
 
 
 def shown_views(result: SavedResult) -> list[ShownView]:
-    """The keyframes of a saved result, whose images are read when they are shown."""
+    """The keyframes of a saved result; images are read on demand."""
     views = result.views
     return [
         ShownView(float(time), np.linalg.inv(T_cw), partial(result.image, number))
@@ -132,7 +131,7 @@ def shown_views(result: SavedResult) -> list[ShownView]:
 
 
 def _rendered_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
-    """The keyframes of the page; those of a long video stay where they are until they are shown."""
+    """The keyframes of the page; images are read on demand."""
 
     def image(number: int) -> UInt8[np.ndarray, "h w 3"] | None:
         return renders[number].image
@@ -155,16 +154,16 @@ def shown_model(
     more_colourings: Callable[[Mesh], Sequence[Colouring]] = lambda mesh: (),
     true_path: Float[np.ndarray, "n 3"] | None = None,
 ) -> ShownModel:
-    """What the page of a result shows.
+    """The model for the page of a result.
 
     Args:
-        trajectory: of all frames.
+        trajectory: poses of all frames.
         views: the keyframes.
-        camera: of their images.
+        camera: camera of their images.
         mesh: the surface, if there is one.
-        disks: of the map, if they are shown.
-        unit: what a unit of the map is.
-        more_colourings: of the surface as it is shown, besides the colours of the images.
+        disks: the map, if its disks are shown.
+        unit: unit of length of the map.
+        more_colourings: further colourings of the shown surface, besides the images' colours.
         true_path: positions of the true camera, in the frame of the map.
     """
     notes, surface, seen, disk_model = [], None, None, None
@@ -200,11 +199,11 @@ def shown_model(
 def stand(
     trajectory: Trajectory, points: Float[np.ndarray, "n 3"] | None, surface: Facets | None
 ) -> tuple[Level, StartView]:
-    """How a result stands upright, and from where it is seen first.
+    """Upright orientation and start view of a result.
 
     Args:
-        trajectory: of all frames.
-        points: of its shape, if it has one.
+        trajectory: poses of all frames.
+        points: points of its shape, if it has one.
         surface: its mesh, if it has one.
     """
     T_wc = _known(trajectory)
@@ -214,7 +213,7 @@ def stand(
 
 
 def _known(trajectory: Trajectory) -> Float[np.ndarray, "k 4 4"]:
-    """Camera to world of the frames whose place is known, or of all where none is."""
+    """Camera-to-world poses of the tracked frames, or of all where none is tracked."""
     tracked = trajectory.tracked
     return trajectory.T_wc[tracked] if tracked.any() else trajectory.T_wc
 
@@ -237,7 +236,7 @@ def _disks(disks: MapSnapshot) -> DiskModel:
 
 
 def _keyframes(views: Sequence[ShownView], camera: Camera) -> list[KeyframeModel]:
-    """All keyframes; of many only some with images, and the more the smaller these."""
+    """All keyframes; only some have images if there are many, and more images are smaller."""
     count = min(len(views), MAX_IMAGES)
     with_image = set(np.linspace(0, len(views) - 1, count).round().astype(int).tolist())
     pixels = IMAGE_BYTES / max(count, 1) / _BYTES_A_PIXEL

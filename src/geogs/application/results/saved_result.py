@@ -1,4 +1,4 @@
-"""A result read from its folder: what ``load_result`` gives."""
+"""A result read from its folder by ``load_result``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,14 +42,14 @@ from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 
 @dataclass(frozen=True, repr=False)
 class SavedResult:
-    """What ``geogs run`` or ``geogs reconstruct`` left in a folder; files are read when asked for.
+    """A result of ``geogs run`` or ``geogs reconstruct`` in a folder; files are read on demand.
 
     Poses are world to camera where they are called ``T_cw``; lengths are in map units.
     """
 
     folder: Path
     disks: MapSnapshot
-    """Disks in the world, on the device asked for."""
+    """Disks in the world, on the chosen device."""
     views: MapViews
 
     def __repr__(self) -> str:
@@ -73,7 +73,7 @@ class SavedResult:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of all frames; of those whose place is not known, between their neighbours.
+        """Poses of all frames; frames of unknown position are interpolated between neighbours.
 
         Raises InputError if a file of them is missing or damaged.
         """
@@ -93,7 +93,7 @@ class SavedResult:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """What ``summary.json`` holds. Raises InputError if it is missing or damaged."""
+        """Content of ``summary.json``. Raises InputError if it is missing or damaged."""
         return read_summary(self.folder)
 
     @cached_property
@@ -104,12 +104,12 @@ class SavedResult:
 
     @cached_property
     def keyframes(self) -> Sequence[RenderedKeyframe]:
-        """Image, pose, depth, normal and weight of the keyframes, made when they are asked for."""
+        """Image, pose, depth, normal and weight of the keyframes, rendered on demand."""
         return OnDemand(range(len(self.views.keyframe_id)), self._keyframe)
 
     @cached_property
     def renderer(self) -> MapRenderer:
-        """What shows the map from anywhere."""
+        """Renderer of the map from any pose."""
         views = self.views
         frame = MapFrame(views.origin, views.unit)
         rules = SurfaceRules(views.min_alpha, views.max_spread, views.plane_reach)
@@ -121,7 +121,7 @@ class SavedResult:
         return self.renderer.render(T_cw, camera)
 
     def rows(self) -> dict[int, SeenRows]:
-        """Where and when a rolling shutter saw what keyframes show, by their place among them.
+        """Rolling-shutter rows of the keyframes, by their index.
 
         Raises InputError if the file is damaged.
         """
@@ -139,7 +139,7 @@ class SavedResult:
             raise InputError("The result was written without keyframe images, which this needs.")
 
     def image(self, number: int) -> UInt8[np.ndarray, "h w 3"] | None:
-        """The image of a keyframe, by its place among them; none if the result has none.
+        """The image of a keyframe, by its index; none if the result has none.
 
         Raises InputError if its file is missing, damaged or of another size.
         """
@@ -151,7 +151,7 @@ class SavedResult:
         return image
 
     def mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
-        """The mask of a keyframe's depth, by its place among them; none if it has none.
+        """The mask of a keyframe's depth, by its index; none if it has none.
 
         Raises InputError if its file is missing, damaged or of another size.
         """
@@ -188,14 +188,14 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
 
     Raises:
         InputError: there is no result, it is damaged, or an older geogs wrote it.
-        OutputError: a command was cut off as it replaced it, and that cannot be completed.
+        OutputError: a command was interrupted while replacing it, and that cannot be completed.
     """
     folder = result_folder(folder)
     return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
 
 
 def result_folder(folder: str | Path) -> Path:
-    """The folder of a result, in which nothing is half replaced.
+    """The folder of a result; an interrupted replacement is completed.
 
     Raises:
         InputError: there is no result.
@@ -211,6 +211,6 @@ def result_folder(folder: str | Path) -> Path:
 
 
 def _check_size(path: Path, picture: np.ndarray, camera: Camera) -> None:
-    """Raises InputError if a picture of the result is not of the size that the map says."""
+    """Raise InputError if a picture of the result is not of the size given by the map."""
     if picture.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{path} is of another size than the result says; was it changed?")

@@ -1,4 +1,4 @@
-"""``summary.json``: what happened, in numbers."""
+"""``summary.json``: statistics of a result."""
 
 import math
 import platform
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def summarise(result: Result) -> dict[str, object]:
-    """What ``summary.json`` holds."""
+    """Content of ``summary.json``."""
     scene, source, mesh = result.scene, result.source, result.mesh
     return {
         "source": source.name,
@@ -51,7 +51,7 @@ def summarise(result: Result) -> dict[str, object]:
 
 
 def statistics(scene: "MappedScene") -> dict[str, object]:
-    """What the scene says of itself; where its lengths are metres, ``scale`` says by what."""
+    """Statistics of the scene; where its lengths are metres, ``scale`` has their origin."""
     said = dict(scene.statistics())
     metric = said.get("metric_scale")
     if isinstance(metric, dict):
@@ -67,7 +67,7 @@ def _finite(values: dict[str, object]) -> dict[str, object]:
 
 
 def source_summary(source: Source | PosedSource) -> dict[str, object]:
-    """What a unit of the map is, and which images were not used."""
+    """Unit of the map, and unused images."""
     if isinstance(source, PosedSource):
         held_out = {"held_out": source.held_out} if source.held_out else {}
         left_out = [{"image": name, "reason": why} for name, why in source.left_out]
@@ -94,7 +94,7 @@ def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
 
     ``until_stream_end`` counts every stage up to the last frame: reading, tracking, loops, mapping,
     map updates, adjustments on the way, checkpoints. ``with_final_stages`` counts those after it,
-    too: final adjustment and refinement, what is rendered, the mesh.
+    too: final adjustment and refinement, rendering, the mesh.
     """
     total = stopwatch.total
     rates = {"with_final_stages": round(frames / max(total, 1e-9), 3)}
@@ -106,7 +106,7 @@ def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
 
 
 def state_spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:
-    """First and last time of every stretch of frames in a state."""
+    """First and last time of each span of frames in a state."""
     inside = np.array([False, *(s == state for s in trajectory.states), False]).astype(int)
     first, last = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1) - 1
     times = trajectory.timestamps

@@ -1,4 +1,4 @@
-"""Meshes as files: of the result, of what there was before it, and of depths without disks."""
+"""Mesh files: of the result, of earlier stages, and of depths without disks."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
-    """The renderings as what mesh extraction takes, each when it is asked for."""
+    """The renderings as input of mesh extraction, each made on demand."""
     return OnDemand(renders, lambda r: DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image))
 
 
@@ -47,7 +47,7 @@ def surface_of(
     progress: RunProgress,
     name: str = "mesh",
 ) -> Mesh | None:
-    """Fuse depth maps to a mesh; where there is no surface, say so as ``name``."""
+    """Fuse depth maps to a mesh; without a surface, a message names it ``name``."""
     try:
         return fused(renders, config, progress, name)
     except InputError as error:
@@ -74,7 +74,7 @@ def write_surface(
 
 
 def write_depth_mesh(output: Path, scene: "MappedScene", progress: RunProgress) -> None:
-    """``depth_fusion/mesh.ply``: the surface of the searched depths, to compare the map with."""
+    """Write ``depth_fusion/mesh.ply``, the surface of the searched depths, for comparison."""
     with scene.stopwatch("depth fusion"):
         path = output / "depth_fusion" / "mesh.ply"
         write_surface(path, scene.depth_maps(), scene.config.mesh, progress, "depth mesh")
@@ -83,10 +83,10 @@ def write_depth_mesh(output: Path, scene: "MappedScene", progress: RunProgress) 
 def write_stage(
     output: Path, scene: "MappedScene", progress: RunProgress, name: Literal["online", "adjusted"]
 ) -> None:
-    """Trajectories and mesh as they stand, to a folder of the stage's name.
+    """Write the present trajectories and mesh to a folder of the stage's name.
 
-    ``online`` is the end of the stream, ``adjusted`` what the final bundle adjustment and the map's
-    update have made of it.
+    ``online`` is the end of the stream, ``adjusted`` the state after the final bundle adjustment
+    and the map's update.
     """
     with scene.stopwatch(f"{name} results"):
         folder = output / name
@@ -106,9 +106,9 @@ def splat_colours(disks: MapSnapshot, views: Sequence[DepthMapView]) -> np.ndarr
 
 
 class Snapshots:
-    """Copies of the disks at the first report of progress after each of some seconds.
+    """Copies of the disks at the first progress report after each of the given times.
 
-    They count from the moment when the images have been read. Nothing is written meanwhile.
+    Times are in seconds, from the end of reading. Nothing is written meanwhile.
     """
 
     def __init__(self, seconds: Sequence[float]) -> None:
@@ -117,7 +117,7 @@ class Snapshots:
         self._early: list[float] = []
 
     def take(self, scene: "Reconstruction") -> None:
-        """Copy the disks if the time for it has come; where there are none yet there is no copy."""
+        """Copy the disks if a time has passed; without disks yet there is no copy."""
         while self._due and scene.elapsed >= self._due[0]:
             disks, seconds = scene.snapshot(), self._due.pop(0)
             if len(disks):
@@ -126,7 +126,7 @@ class Snapshots:
                 self._early.append(seconds)
 
     def write(self, output: Path, scene: "Reconstruction", progress: RunProgress) -> None:
-        """``snapshots/<seconds>/{map.safetensors, mesh.ply}`` for each copy.
+        """Write ``snapshots/<seconds>/{map.safetensors, mesh.ply}`` for each copy.
 
         Raises:
             OutputError: a file cannot be written.

@@ -1,4 +1,4 @@
-"""One line on whether a run is to be relied on, and why not."""
+"""Verdict: whether a run is reliable, and the reason if not."""
 
 from dataclasses import dataclass
 
@@ -8,67 +8,67 @@ from geogs.evaluation.trajectory_errors import extent_of
 from geogs.types import Trajectory, Uncertainty
 
 MAX_LOST = 0.2
-"""Fraction of the frames without a pose above which nothing is called reliable."""
+"""Largest fraction of frames without a pose in a reliable result."""
 MAX_ORIENTATION_ONLY = 0.5
-"""Fraction of frames with no more than an orientation above which nothing is: what there is of a
-map is right, but it is not what the video is about."""
+"""Largest fraction of frames with only an orientation in a reliable result: with more, the map is
+right, but covers little of the video."""
 MAX_POSITION_DEVIATION = 0.05
-"""Deviation of the camera's place, of the extent of its path."""
+"""Largest standard deviation of the camera position, relative to the path's extent."""
 MAX_DEPTH_DEVIATION = 0.2
-"""Relative deviation of the best known depths."""
+"""Largest relative standard deviation of the best known depths."""
 MAX_FOCAL_DEVIATION = 0.15
-"""Relative deviation of the focal length, by which all that is seen is too wide or too narrow: 14 %
-and less in rendered videos where it was right (docs/notebook/lens.md)."""
+"""Largest relative deviation of the focal length, whose error makes the scene too wide or narrow:
+14 % and less in rendered videos where it was right (docs/notebook/lens.md)."""
 MAX_MISFIT = 1.35
-"""Residual of a tenth of the keyframes over that of the others: up to 1.29 in rendered videos that
-were followed rightly, from 1.41 on where tracking had failed (docs/notebook/uncertainty.md)."""
+"""Largest ratio of the residuals of a tenth of the keyframes to the others': up to 1.29 in rendered
+videos with correct tracking, from 1.41 on where it had failed (docs/notebook/uncertainty.md)."""
 MAX_FOCAL_CHANGE = 0.05
-"""Relative difference of the focal lengths that parts of a video want
+"""Largest relative difference of the focal lengths estimated from parts of a video
 (docs/notebook/uncertainty.md)."""
 MAX_LENS_CHANGE = 0.1
-"""Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
-has one (docs/notebook/lens.md)."""
+"""Largest reduction of the matches' cost by per-frame lenses, as a fraction; below 0.06 for a
+constant lens (docs/notebook/lens.md)."""
 MAX_LENS_CHANGE_LEFT = 0.03
-"""The same where such lenses were found: up to 0.024 where they are right, from 0.046 on where the
-map was wrong from its start (docs/notebook/lens.md)."""
+"""The same where per-frame lenses were estimated: up to 0.024 where they are right, from 0.046 on
+where the map was wrong from its start (docs/notebook/lens.md)."""
 MIN_JOINED = 0.95
-"""Fraction of the keyframes that one structure holds; of the others a few may be out of place."""
+"""Least fraction of keyframes in one rigid structure; a few of the others may be misplaced."""
 NO_SHAPE = 0.5
-"""Relative deviation of the best known depths from which on they are no evidence of a surface."""
+"""Relative deviation of the best known depths from which on there is no evidence of a surface."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a run knows of itself."""
+    """Reliability of a run, estimated without ground truth."""
 
     is_reliable: bool
     sentence: str
-    """What the terminal says."""
+    """Message on the terminal."""
     lost: float
-    """Fraction of the frames of which nothing is known."""
+    """Fraction of the frames without pose and orientation."""
     orientation_only: float
-    """Fraction of the frames of which no more than the orientation is known."""
+    """Fraction of the frames of which only the orientation is known."""
     position: float
-    """Median deviation of the camera's place, of the extent of its path: the root of the mean
-    squared distance from its middle."""
+    """Median standard deviation of the camera position, relative to the extent of its path: the
+    root of the mean squared distance from its middle."""
     rotation_deg: float
-    """Median deviation of its orientation."""
+    """Median standard deviation of the orientation, degrees."""
     depth: float
     """Median relative deviation of depths, of the best known 15 % of what each keyframe sees."""
     focal: float = 0.0
     """Relative deviation of the focal length."""
     focal_change: float = 0.0
-    """Relative difference of the focal lengths that parts of the video want."""
+    """Relative difference of the focal lengths estimated from parts of the video."""
     lens_change: float = 0.0
-    """Part of the matches' cost that is left because the lens changes from frame to frame."""
+    """Fraction of the matches' cost that is due to a lens that changes from frame to frame."""
     joined: float = 1.0
-    """Fraction of the keyframes in the largest part that one rigid structure holds together."""
+    """Fraction of the keyframes in the largest rigid structure."""
     lens_varies: bool = False
-    """Whether the lens changes from frame to frame, in a way that was found or not."""
+    """Whether the lens changes from frame to frame, estimated or not."""
 
     @property
     def has_shape(self) -> bool:
-        """Whether depths are known well enough for any surface."""
+        """Whether depths are accurate enough for a surface."""
         return self.depth < NO_SHAPE
 
 
@@ -79,15 +79,15 @@ def verdict(
     why_not: str = "",
     is_explained: bool = True,
 ) -> Verdict:
-    """Whether trajectory and shape are to be relied on.
+    """Judge the reliability of trajectory and shape.
 
     Args:
-        trajectory: of all frames.
-        keyframes: of the keyframes alone.
-        known: how well frames are known.
-        why_not: why no map could be started, if so.
-        is_explained: whether a camera was found before the run that explains how its views move,
-            where nobody said the focal length.
+        trajectory: poses of all frames.
+        keyframes: poses of the keyframes alone.
+        known: standard deviations of the frames.
+        why_not: reason why no map could be started, if so.
+        is_explained: whether the self-calibration before the run explained the motion in its
+            views; true where the focal length was given.
     """
     extent = extent_of(keyframes.T_wc)
     states = trajectory.states
@@ -159,10 +159,10 @@ def _median(values: np.ndarray) -> float:
 
 
 def _finely(value: float) -> str:
-    """A fraction in percent, of a small one the first digit."""
+    """Format a fraction in percent; a small one with its first digit."""
     return f"{value:.1%}" if value >= 0.001 else f"{100 * value:.1g}%"
 
 
 def _known_to(deviation: float, known: str, unknown: str) -> str:
-    """One clause or, where a deviation is so large that it says nothing, another."""
+    """The clause ``known`` or, where a deviation is too large to mean anything, ``unknown``."""
     return known.format(deviation) if deviation < 10 else unknown

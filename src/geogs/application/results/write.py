@@ -1,4 +1,4 @@
-"""Everything that a run or a reconstruction leaves in its folder."""
+"""Writing of all files of a run or a reconstruction to its folder."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -26,10 +26,10 @@ from geogs.types import RenderedKeyframe
 
 
 def write_results(output: str | Path, result: Result, keyframe_images: bool = True) -> None:
-    """Write all files of a result into a folder, in place of those of an earlier one.
+    """Write all files of a result into a folder; an earlier result is replaced.
 
-    ``keyframe_images`` says whether the images of the keyframes are kept, too. Where a file cannot
-    be written, the earlier result stays.
+    ``keyframe_images``: whether the images of the keyframes are written, too. If a file cannot be
+    written, the earlier result stays.
 
     Raises:
         OutputError: a file cannot be written.
@@ -45,10 +45,10 @@ def write_files(
     write_more: Callable[[], None] = lambda: None,
     keyframe_images: bool = True,
 ) -> None:
-    """Write poses first, then map, pictures and mesh beside each other, what else was asked for,
-    and the page, which shows all of it.
+    """Write poses first, then map, pictures and mesh in parallel, other requested files, and the
+    page, which shows all of them.
 
-    ``write_more`` writes the rest, which the summary then counts.
+    ``write_more`` writes the other files, before the summary.
 
     Raises:
         OutputError: a file cannot be written.
@@ -88,7 +88,7 @@ def write_files(
 def _write_map(
     output: Path, result: Result, renders: Sequence[RenderedKeyframe], keyframe_images: bool
 ) -> None:
-    """Keyframes, map and splats, beside the mesh."""
+    """Write keyframes, map and splats, in parallel to the mesh."""
     scene, source, disks = result.scene, result.source, result.map
     with scene.stopwatch.aside():
         if result.why_no_map is None:
@@ -102,13 +102,13 @@ def _write_map(
 
 @on_one_torch_thread
 def _write_pictures(output: Path, result: Result, shown: Sequence[RenderedKeyframe]) -> None:
-    """Draw the pictures of the report, beside the mesh."""
+    """Draw the pictures of the report, in parallel to the mesh."""
     with result.scene.stopwatch.aside():
         write_pictures(output / "report", result.trajectory, shown)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:
-    """All settings as YAML."""
+    """Write all settings as YAML."""
     import yaml
 
     plain = json.loads(json.dumps(asdict(config), default=str))

@@ -19,11 +19,11 @@ from geogs.slam import Slam
 
 _log = logging.getLogger(__name__)
 MAX_POSES = 10_000
-"""Most poses of a path that is published; of a longer one the latest."""
+"""Largest number of poses in the published path; the latest are kept."""
 
 
 def run_node(settings: NodeSettings) -> None:
-    """Track until the node is shut down, then keep the map if that is asked for.
+    """Track until the node is shut down, then save the map if ``output`` is given.
 
     Raises:
         InputError: there is no ROS 2.
@@ -51,7 +51,7 @@ def run_node(settings: NodeSettings) -> None:
 
 
 def message_of(kind: str, **fields: Any) -> Any:
-    """A message of ROS 2, of a kind such as ``geometry_msgs/msg/Point``."""
+    """Make a ROS 2 message of a kind such as ``geometry_msgs/msg/Point``."""
     package, _, name = kind.split("/")
     message = getattr(importlib.import_module(f"{package}.msg"), name)()
     for field, value in fields.items():
@@ -61,7 +61,7 @@ def message_of(kind: str, **fields: Any) -> Any:
 
 
 class CameraNode:
-    """Subscribes to a camera and publishes what is known of it."""
+    """Subscribes to a camera and publishes pose, path, cloud and mesh."""
 
     def __init__(self, node: Any, settings: NodeSettings) -> None:
         self._settings = settings
@@ -74,7 +74,7 @@ class CameraNode:
         compressed = settings.image.rsplit("/", 1)[-1] == "compressed"
         image = _type("sensor_msgs", "CompressedImage" if compressed else "Image")
         node.create_subscription(_type("sensor_msgs", "CameraInfo"), settings.info, self.info, 1)
-        # One image waits at most: what comes faster than it is tracked is dropped by ROS.
+        # One image waits at most: ROS drops images that come faster than they are tracked.
         node.create_subscription(image, settings.image, self.image, 1)
         kinds = {
             "pose": ("geometry_msgs", "PoseStamped"), "path": ("nav_msgs", "Path"),
@@ -86,7 +86,7 @@ class CameraNode:
         }
 
     def info(self, message: Any) -> None:
-        """Take the camera, once."""
+        """Take the camera parameters, once."""
         if self._slam is not None:
             return
         is_rectified = self._settings.image.rsplit("/", 1)[-1].startswith("image_rect")
@@ -101,7 +101,7 @@ class CameraNode:
         self._slam = Slam(self._rectifier.camera, config, self._settings.device, live=True)
 
     def image(self, message: Any) -> None:
-        """Track an image and say where it was taken."""
+        """Track an image and publish its pose."""
         picture = picture_of(message).picture
         if self._slam is None or self._rectifier is None or picture is None:
             return
@@ -133,7 +133,7 @@ class CameraNode:
             self._publish["mesh"](self._messages.mesh(seconds, mesh))
 
     def finish(self) -> None:
-        """Keep the map, if that is asked for and there is one."""
+        """Save the map, if an output folder is given and there is a map."""
         if self._slam is None or self._settings.output is None or not self._slam.frames:
             return
         self._slam.finish()

@@ -1,4 +1,4 @@
-"""What the node publishes, as messages of ROS 2; nothing here needs ROS.
+"""Messages of ROS 2 that the node publishes; nothing here needs ROS.
 
 Axes are those of the map: x right, y down, z forward of the first camera. Lengths are the map's.
 """
@@ -18,8 +18,8 @@ from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
 
 Make = Callable[..., Any]
-"""Makes a message of a type, such as ``geometry_msgs/msg/Point``, from its fields by name; those
-that are not given are as ROS has them."""
+"""Makes a message of a type, such as ``geometry_msgs/msg/Point``, from its fields by name; others
+have ROS's defaults."""
 
 FLOAT32, TRIANGLE_LIST = 7, 11
 """Numbers of ``sensor_msgs/msg/PointField`` and ``visualization_msgs/msg/Marker``."""
@@ -35,14 +35,14 @@ class Messages:
     """Name of the map's frame."""
 
     def header(self, seconds: float) -> Any:
-        """``std_msgs/msg/Header``."""
+        """Make a ``std_msgs/msg/Header``."""
         whole = math.floor(seconds)
         nanoseconds = min(round((seconds - whole) * 1e9), 999_999_999)
         stamp = self.make("builtin_interfaces/msg/Time", sec=whole, nanosec=nanoseconds)
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=self.frame_id)
 
     def pose(self, seconds: float, T_wc: Float64[Tensor, "4 4"]) -> Any:
-        """``geometry_msgs/msg/PoseStamped`` of a camera."""
+        """Make a ``geometry_msgs/msg/PoseStamped`` of a camera."""
         w, x, y, z = matrix_to_quaternion(T_wc[:3, :3]).tolist()
         rotation = self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
         place = self.point(T_wc[:3, 3].tolist())
@@ -50,11 +50,11 @@ class Messages:
         return self.make("geometry_msgs/msg/PoseStamped", header=self.header(seconds), pose=pose)
 
     def path(self, seconds: float, poses: Sequence[Any]) -> Any:
-        """``nav_msgs/msg/Path`` of poses that were made here."""
+        """Make a ``nav_msgs/msg/Path`` of poses made by :meth:`pose`."""
         return self.make("nav_msgs/msg/Path", header=self.header(seconds), poses=list(poses))
 
     def cloud(self, seconds: float, disks: MapSnapshot) -> Any:
-        """``sensor_msgs/msg/PointCloud2`` of the disks' centres and normals."""
+        """Make a ``sensor_msgs/msg/PointCloud2`` of the disks' centres and normals."""
         rows = torch.cat([disks.position, disks.normal], 1).float().cpu().numpy()
         rows = np.ascontiguousarray(rows, dtype="<f4")
         fields = [
@@ -71,7 +71,7 @@ class Messages:
         )  # fmt: skip
 
     def mesh(self, seconds: float, mesh: Mesh) -> Any:
-        """``visualization_msgs/msg/Marker``: a list of triangles, grey."""
+        """Make a ``visualization_msgs/msg/Marker``: a list of triangles, grey."""
         corners = mesh.vertices[mesh.faces].reshape(-1, 3).tolist()
         one = {"x": 1.0, "y": 1.0, "z": 1.0}
         grey = self.make("std_msgs/msg/ColorRGBA", r=0.7, g=0.7, b=0.7, a=1.0)
@@ -87,6 +87,6 @@ class Messages:
         )  # fmt: skip
 
     def point(self, xyz: Sequence[float]) -> Any:
-        """``geometry_msgs/msg/Point``."""
+        """Make a ``geometry_msgs/msg/Point``."""
         x, y, z = xyz
         return self.make("geometry_msgs/msg/Point", x=x, y=y, z=z)

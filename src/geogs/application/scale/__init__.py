@@ -1,1 +1,1 @@
-"""Metres for a map: by a known distance, tags of known size, or the camera's height."""
+"""Metric scale of a map: by a known distance, tags of known size, or the camera's height."""

@@ -1,4 +1,4 @@
-"""Brings a run's map to metres, at its end."""
+"""Conversion of a run's map to metres, at its end."""
 
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.scale.known_length import KnownLength, SensorScale, find_scale
@@ -18,7 +18,7 @@ from geogs.tracking.graph.measured_odometry import OdometryAgreement
 def make_metric(
     slam: Slam, stream: Source, source: KnownLength | SensorScale | None, progress: RunProgress
 ) -> None:
-    """Bring the map to metres by what is known; where it does not tell, say so and leave it."""
+    """Scale the map to metres by a known length; if that fails, report it and leave the map."""
     if not slam.segments.keyframe_ids:
         return
     for sentence in sentences_on_poses(slam.segments.main.map.odometry.agreement()):
@@ -40,7 +40,7 @@ def make_metric(
 
 
 def sentences_on_poses(found: OdometryAgreement) -> list[str]:
-    """Sentences on poses given beside the images; none where there are none."""
+    """Sentences on the use of pose priors; none without them."""
     if not found.motions:
         return []
     fitting = f"{found.fitting:.0%} of {found.motions} motions between keyframes"
@@ -53,7 +53,7 @@ def sentences_on_poses(found: OdometryAgreement) -> list[str]:
 
 
 def measurable_run(slam: Slam) -> MeasurableScene:
-    """The world of a run as a scale is looked for in."""
+    """The map of a run for the estimation of its scale."""
 
     def seen(id: int) -> SeenKeyframe:
         keyframe = slam.world.keyframes[id]

@@ -1,4 +1,4 @@
-"""The scale by points whose distance is known: pixels of a frame, lifted by the map's depth."""
+"""The scale by known distances between points: pixels of a frame, lifted by the map's depth."""
 
 from dataclasses import dataclass
 
@@ -12,26 +12,26 @@ from geogs.io.sources.calibration import Calibration
 from geogs.types import MetricScale
 
 CLICK_ERROR = 1.0
-"""Pixels of the image as it came by which a point that somebody gives is off."""
+"""Error of a given point, in pixels of the stored image."""
 _RADIUS = 2
-"""Pixels of the depth map on each side of a point that say how far it is."""
+"""Half-width of the window of the depth map around a point, in pixels."""
 
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """Two pixels of a frame whose points are so far from each other."""
+    """Two pixels of a frame with the distance of their points."""
 
     frame: int
     """Number of the frame in the source's selection, from 0."""
     first: tuple[float, float]
-    """Column and row in the image as it came, upright."""
+    """Column and row in the stored image, upright."""
     second: tuple[float, float]
     metres: float
 
 
 @dataclass(frozen=True)
 class KnownDistances:
-    """Several distances, which vote."""
+    """Several distances, which are averaged."""
 
     each: tuple[KnownDistance, ...]
 
@@ -39,22 +39,22 @@ class KnownDistances:
 def scale_by_distances(
     scene: MeasurableScene, known: KnownDistances, calibration: Calibration
 ) -> MetricScale:
-    """The mean of what the distances say, by their variances.
+    """The mean scale of the distances, weighted by their inverse variances.
 
     Args:
-        scene: whose unit is asked.
-        known: pixels of images as they came.
-        calibration: of these images.
+        scene: the map to scale.
+        known: pixels of stored images.
+        calibration: camera of these images.
 
     Raises:
-        InputError: a frame or a pixel is not there, or the map has no depth at it.
+        InputError: a frame or a pixel does not exist, or the map has no depth at it.
     """
     each = [_one(scene, one, calibration) for one in known.each]
     factors, deviations = np.array(each).T
     weight = deviations**-2.0
     factor = float((weight * factors).sum() / weight.sum())
     deviation = weight.sum() ** -0.5
-    if len(each) > 1:  # their disagreement says what no depth map knows of itself
+    if len(each) > 1:  # their disagreement includes errors that depth maps do not report
         chi = float((weight * (factors - factor) ** 2).sum() / (len(each) - 1))
         deviation *= max(1.0, chi) ** 0.5
     count = "a known distance" if len(each) == 1 else f"{len(each)} known distances"
@@ -64,7 +64,7 @@ def scale_by_distances(
 def _one(
     scene: MeasurableScene, known: KnownDistance, calibration: Calibration
 ) -> tuple[float, float]:
-    """Metres to the unit by one distance, and its deviation."""
+    """Metres per map unit by one distance, and its deviation."""
     trajectory = scene.trajectory
     if known.frame >= len(trajectory.T_wc) or not trajectory.tracked[known.frame]:
         raise InputError(

@@ -10,25 +10,25 @@ from geogs.errors import InputError
 from geogs.types import MetricScale
 
 MAX_VIEWS = 40
-"""Keyframes whose surfaces are looked at, at most."""
+"""Largest number of keyframes whose surfaces are used."""
 POINTS_PER_VIEW = 400
-"""Points of each."""
+"""Number of points of each keyframe."""
 MAX_TILT = np.radians(35.0)
-"""Angle by which the ground's normal may differ from the mean of the cameras' own upward axes."""
+"""Largest angle between the ground's normal and the mean of the cameras' upward axes."""
 MAX_DISTANCE = 0.02
-"""Distance of a point from the plane, as a part of the cameras' height, that makes it ground."""
+"""Largest distance of a ground point from the plane, relative to the cameras' height."""
 _SAMPLES = 1000
 _MAX_SCORED = 3000
-"""Points that say how good a plane is, at most."""
+"""Largest number of points to score a plane by."""
 _MAX_BELOW = 0.05
-"""Fraction of all points that may lie clearly under the ground."""
+"""Largest fraction of points clearly below the ground."""
 _MIN_SUPPORT = 0.03
-"""Fraction of all points that the ground has, at least."""
+"""Least fraction of points on the ground."""
 
 
 @dataclass(frozen=True)
 class CameraHeight:
-    """The camera is carried so high over the ground, in the median."""
+    """Median height of the camera over the ground."""
 
     metres: float
 
@@ -36,7 +36,7 @@ class CameraHeight:
 def scale_by_height(scene: MeasurableScene, known: CameraHeight) -> MetricScale:
     """The median height of the keyframes over the ground, which is found by RANSAC.
 
-    The deviation is the spread of the heights over the path: nobody carries a camera level.
+    The deviation is the spread of the heights over the path: a hand-held camera moves up and down.
 
     Raises:
         InputError: there is no such plane.
@@ -75,7 +75,7 @@ def ground_plane(
 ) -> Float64[np.ndarray, "4"] | None:
     """Unit normal n, upward, and offset of the plane ``n . x + offset = 0`` below all cameras.
 
-    The one with most points of all that have hardly any below them; None without.
+    The one with most points among those with hardly any points below; None if there is none.
     """
     if len(cloud) < 3:
         return None
@@ -118,7 +118,7 @@ def _support(
     cloud: Float64[np.ndarray, "n 3"],
     centres: Float64[np.ndarray, "k 3"],
 ) -> float:
-    """Points on a plane; 0 where a camera is not above it, or much lies below."""
+    """Number of points on a plane; 0 where a camera is not above it, or many points lie below."""
     heights = centres @ plane[:3] + plane[3]
     height = float(np.median(heights))
     if heights.min() <= 0:

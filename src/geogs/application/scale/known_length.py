@@ -1,4 +1,4 @@
-"""What is known in metres, as ``--scale-from`` says it, and the scale of a map by that."""
+"""Known lengths in metres, as given by ``--scale-from``, and the scale of a map by them."""
 
 import re
 from dataclasses import dataclass
@@ -16,27 +16,27 @@ _DISTANCE = re.compile(rf"(\d+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER
 _TAG = re.compile(rf"aruco:(DICT_\w+):{_NUMBER}m?")
 _HEIGHT = re.compile(rf"height:{_NUMBER}m?")
 MAX_LENGTH = 1e6
-"""Metres of anything that is known."""
+"""Upper limit of a known length, metres."""
 HOW = (
     "give FRAME:u1,v1,u2,v2=1.25m, several of them with semicolons, aruco:DICT_5X5_50:0.12, "
     "height:1.6 or sensor"
 )
-"""What a mistake is answered with."""
+"""Hint in error messages."""
 
 
 @dataclass(frozen=True)
 class SensorScale:
-    """A depth sensor says it."""
+    """The scale of a depth sensor."""
 
 
 KnownLength = KnownDistances | TagSize | CameraHeight
-"""What a map can be measured against."""
+"""Known lengths that a map can be scaled by."""
 
 
 def find_scale(scene: MeasurableScene, known: KnownLength, calibration: Calibration) -> MetricScale:
-    """Metres to the map unit; ``calibration`` is that of the images as they came.
+    """Estimate metres per map unit; ``calibration`` is that of the stored images.
 
-    Raises InputError where the scene does not tell.
+    Raises InputError where the scene does not determine it.
     """
     match known:
         case KnownDistances():
@@ -48,7 +48,7 @@ def find_scale(scene: MeasurableScene, known: KnownLength, calibration: Calibrat
 
 
 def scale_source(text: str) -> KnownLength | SensorScale | None:
-    """What a text says; none where it is empty. Raises InputError where it cannot be understood."""
+    """Parse ``--scale-from``; none where it is empty. Raises InputError for a wrong text."""
     text = text.strip()
     if not text:
         return None

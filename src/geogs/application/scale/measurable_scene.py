@@ -1,4 +1,4 @@
-"""What a scale is looked for in: a map seen from anywhere, and its keyframes' images."""
+"""Input of scale estimation: a map that can be rendered, and its keyframes' images."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class SeenKeyframe:
 
 @dataclass(frozen=True, eq=False)
 class MeasurableScene:
-    """A map whose unit is asked for."""
+    """A map whose unit is to be estimated."""
 
     camera: Camera
     """Camera of the images."""
@@ -53,7 +53,7 @@ def measurable(
     keyframes: Sequence[SeenKeyframe],
     trajectory: Trajectory,
 ) -> MeasurableScene:
-    """A map that ``renderer`` shows, and its keyframes, whose images are of ``camera``."""
+    """Make a scene of ``renderer``'s map and its keyframes, whose images are of ``camera``."""
 
     def surface(T_cw: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "h w"]:
         return renderer.surface(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
@@ -62,6 +62,6 @@ def measurable(
 
 
 def scale_sentence(found: MetricScale) -> str:
-    """A found scale in a sentence."""
+    """A sentence on the estimated scale."""
     metres = f"{found.factor:.5g} metres to the map unit (+- {found.deviation:.1%})"
     return f"Scale: {metres}, by {found.origin}."

@@ -17,9 +17,9 @@ from geogs.types import MetricScale
 MIN_PARALLAX = np.radians(1.5)
 """Least angle between two rays to a corner."""
 MAX_REPROJECTION_ERROR = 3.0
-"""Pixels by which a corner may miss its triangulated place."""
+"""Largest reprojection error of a triangulated corner, in pixels."""
 _COMMON_ERROR = 0.003
-"""Fraction of a tag's size by which printing, focal length and blur leave it wrong in common."""
+"""Common relative error of all tag sizes, by printing, focal length and blur."""
 _ROUNDS = 4
 
 Corners = Float64[np.ndarray, "4 2"]
@@ -29,7 +29,7 @@ Sighting = tuple[Float64[np.ndarray, "4 4"], Corners]
 
 @dataclass(frozen=True)
 class TagSize:
-    """Square tags of one family, whose black squares have so long a side."""
+    """Square tags of one family, with the side length of their black squares."""
 
     family: str
     """Name of OpenCV's dictionary."""
@@ -37,10 +37,10 @@ class TagSize:
 
 
 def scale_by_tags(scene: MeasurableScene, known: TagSize) -> MetricScale:
-    """The median of what all sides and diagonals of all tags say.
+    """The median scale of all sides and diagonals of all tags.
 
     Raises:
-        InputError: OpenCV has no such family, or no tag is seen from two places.
+        InputError: OpenCV has no such family, or no tag is seen from two positions.
     """
     seen: dict[int, list[Sighting]] = defaultdict(list)
     detect = TagDetector(known.family)
@@ -91,7 +91,7 @@ class TagDetector:
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> dict[int, Corners]:
         """The corners of each tag by its number, in its own order; those seen twice are left out.
 
-        They are where the lines through the edges meet, to a fraction of a pixel.
+        They are the sub-pixel intersections of the edges' lines.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         corners, ids, _ = self._detector.detectMarkers(grey)
@@ -105,9 +105,9 @@ class TagDetector:
 
 
 def refined(grey: UInt8[np.ndarray, "h w"], corners: Corners) -> Corners:
-    """Corners where the lines meet along which the image changes most across each edge.
+    """Refine corners to the intersections of the lines of steepest gradient along the edges.
 
-    As they were given where an edge is too short or too faint.
+    Unchanged where an edge is too short or too faint.
     """
     lines = []
     for k in range(4):
@@ -140,7 +140,7 @@ def _edge_line(
     total = slope.sum(1)
     if total.min() <= 0:
         return None
-    # The middle of the step: its centroid, once the flanks' noise has been taken off.
+    # The middle of the step: its centroid, after subtraction of the flanks' noise.
     slope = np.maximum(slope - np.median(slope, 1, keepdims=True), 0)
     if (slope.sum(1) <= 0).any():
         return None
@@ -156,9 +156,9 @@ def _edge_line(
 def triangulated(
     camera: Camera, rays: Sequence[tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "2"]]]
 ) -> Float64[np.ndarray, "3"] | None:
-    """The world point that pixels in several views show; None where they are too near each other.
+    """Triangulate a world point from pixels in several views; None if the views are too close.
 
-    Linear, weighted by distance so that errors count in pixels, without views that miss it.
+    Linear, weighted by distance so that errors are in pixels, without outlier views.
     """
     K = camera.matrix().numpy()
     P = np.array([K @ T[:3] for T, _ in rays])

@@ -1,1 +1,1 @@
-"""Photographs, and videos that tracking cannot follow: placed by structure from motion."""
+"""Structure from motion, for photographs and for videos where tracking fails."""

@@ -1,9 +1,9 @@
-"""Whether two trajectories of a video agree in how its camera rotates.
+"""Agreement of two trajectories of a video in the camera's rotation.
 
-A wrong start may misplace the camera, but hardly its rotation from frame to frame: what was tracked
-and checked against the images is right to a fraction of a degree, whatever became of scale and
-drift. So a second trajectory that rotates otherwise is wrong, however small its deviations; and one
-that does so just between two frames joins its parts wrongly there.
+A wrong initialisation may misplace the camera, but hardly its rotation between frames: tracked
+rotations that were checked against the images are right to a fraction of a degree, regardless of
+scale and drift. So a second trajectory with other rotations is wrong, however small its standard
+deviations; and one that differs just between two frames joins its parts wrongly there.
 """
 
 import numpy as np
@@ -13,21 +13,21 @@ from geogs.evaluation.rotation_errors import relative_rotation_error, rotation_a
 from geogs.types import Trajectory
 
 FRAMES_APART = 5
-"""Frames, of those that both place, from the first to the second of a pair."""
+"""Distance of the frames of a pair, counted in frames located by both trajectories."""
 MIN_PAIRS = 10
-"""Pairs below which nothing can be said."""
+"""Least number of pairs for a test."""
 MAX_DIFFERENCE_DEG = 1.0
-"""Degrees by which the rotations of a pair may differ, ..."""
+"""Largest difference of a pair's rotations in degrees, plus ..."""
 MAX_RELATIVE_DIFFERENCE = 0.15
-"""... and fraction of the rotation: by so much do wrong focal lengths scale it."""
+"""... this fraction of the rotation: wrong focal lengths scale it by that much."""
 MAX_JOINT_DEG = 30.0
-"""Degrees by which the rotation between two frames in a row may differ at most."""
+"""Largest difference of the rotations between two consecutive frames in degrees."""
 
 
 def rotations_agree(first: Trajectory, second: Trajectory) -> bool:
-    """Whether most pairs of frames are rotated alike by both, or there are too few of them.
+    """Whether the rotations of most frame pairs agree, or there are too few pairs.
 
-    Frames are known by their times; those count whose places both know.
+    Frames are matched by their times; those count that both trajectories located.
     """
     known = first.of("tracked"), second.of("tracked")
     _, R = _common(*known)
@@ -41,8 +41,8 @@ def rotations_agree(first: Trajectory, second: Trajectory) -> bool:
 
 
 def has_wrong_joint(tracked: Trajectory, sharp: Trajectory) -> bool:
-    """Whether two sharp frames in a row are rotated quite otherwise than by tracking, which lost
-    no frame between them."""
+    """Whether the rotation between two consecutive sharp frames differs much from tracking, which
+    lost no frame between them."""
     times, R = _common(tracked.of("tracked"), sharp)
     number = np.searchsorted(tracked.timestamps, times)
     lost = np.cumsum([state != "tracked" for state in tracked.states])[number]
@@ -53,6 +53,6 @@ def has_wrong_joint(tracked: Trajectory, sharp: Trajectory) -> bool:
 def _common(
     first: Trajectory, second: Trajectory
 ) -> tuple[Float64[np.ndarray, "n"], list[Float64[np.ndarray, "n 3 3"]]]:
-    """Times of the frames of both, and their orientations by each."""
+    """Times of the common frames, and their orientations by each trajectory."""
     times, *rows = np.intersect1d(first.timestamps, second.timestamps, return_indices=True)
     return times, [k.T_wc[row, :3, :3] for k, row in zip((first, second), rows, strict=True)]

@@ -1,4 +1,4 @@
-"""The frames of a video that structure from motion works on: sharp ones that overlap."""
+"""Frame selection for structure from motion of a video: sharp frames that overlap."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -12,17 +12,17 @@ from geogs.stopwatch import StageProgress, unwatched
 from geogs.types import Frame
 
 MAX_STRETCH_SECONDS = 0.33
-"""Time of a video of which one frame is chosen at least."""
+"""Longest time without a selected frame."""
 SPARSE_FPS = 6.0
-"""Frames a second up to which all are: neighbours share little enough as it is."""
+"""Frame rate up to which all frames are selected: neighbours overlap little already."""
 MIN_FRAMES, MAX_FRAMES = 40, 250
-"""Frames that are chosen of a video whose length is known, at least and, for the time, at most."""
+"""Least number of frames selected from a video of known length, and largest by time alone."""
 MAX_MOVING_FRAMES = 500
-"""Frames that are chosen at most."""
+"""Largest number of selected frames."""
 MAX_SHIFT = 0.15
-"""Motion in the image after which another frame is chosen, of its longer side."""
+"""Image motion after which another frame is selected, relative to the longer side."""
 _EDGE, _CORNERS, _QUALITY, _CORNER_DISTANCE = 320, 200, 0.01, 7
-"""Motion is followed at this longer side, by so many corners so far apart."""
+"""Longer image side for motion tracking, and number, quality and distance of corners."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +37,13 @@ class ChosenFrames:
 def choose_frames(
     video: Iterable[Frame], fps: float, length: int | None, progress: StageProgress = unwatched
 ) -> ChosenFrames:
-    """The sharpest frame of each stretch, which ends after some time, or where the image has moved.
+    """Select the sharpest frame of each stretch, which ends after some time or image motion.
 
     Args:
-        video: is read twice.
-        fps: its frames a second; pictures that come without times, and far apart, may have any.
-        length: how many frames it has, if that is known.
-        progress: called with a stage and its finished part; what it raises ends the work.
+        video: the video, which is read twice.
+        fps: its frame rate; arbitrary for single pictures without times.
+        length: number of its frames, if known.
+        progress: called with a stage and its finished fraction; an exception ends the work.
     """
     every = stretch_length(fps, length)
     times: list[float] = []
@@ -65,7 +65,7 @@ def choose_frames(
 
 
 def stretch_length(fps: float, length: int | None) -> int:
-    """Frames of a video of which one is chosen at least."""
+    """Length of a stretch, from which at least one frame is selected, in frames."""
     every = max(1, round(MAX_STRETCH_SECONDS * fps)) if fps > SPARSE_FPS else 1
     if length is not None:
         every = max(math.ceil(length / MAX_FRAMES), min(every, max(1, length // MIN_FRAMES)))
@@ -78,10 +78,10 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
 
 
 def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
-    """Median motion of the corners of an image up to the next one, of the longer side.
+    """Median motion of corners from an image to the next, relative to the longer side.
 
-    Corners that are not found again count as far away: where they are most, it is 1. So it is where
-    there are none; what the camera does then is not known.
+    Lost corners count as a motion of 1, so it is 1 if most are lost. It is also 1 without any
+    corners, as the motion is unknown then.
     """
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _CORNER_DISTANCE)
     if corners is None:
@@ -100,7 +100,7 @@ def _followed(
     after: UInt8[np.ndarray, "h w"],
     corners: Float32[np.ndarray, "n 1 2"],
 ) -> tuple[Float32[np.ndarray, "n 1 2"], np.ndarray]:
-    """Where corners are in another image, and which of them are found there."""
+    """Track corners to another image: positions, and which of them were found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy())
     return there, found[:, 0] != 0
 
@@ -127,7 +127,7 @@ def _sharpest(sharp: Sequence[float], moved: Sequence[float], every: int) -> lis
 
 
 def _stretches(moved: Sequence[float], shift: float, every: int) -> list[int]:
-    """Where each stretch begins."""
+    """Index of the first frame of each stretch."""
     starts: list[int] = []
     so_far = np.inf
     for k, step in enumerate(moved):

@@ -1,4 +1,4 @@
-"""Frames that have no place at the end of the work, tried once more about those that have one."""
+"""Lost frames at the end of the work: another search by structure from motion."""
 
 import copy
 import math
@@ -24,18 +24,18 @@ from geogs.threads import worker_count
 from geogs.types import FoundFrames, Frame, Trajectory, Uncertainty
 
 NEIGHBOURS = 10
-"""Frames with a place before each lost one, and as many after it, about which it is looked for."""
+"""Number of located frames before each lost one, and after it, that are used to find it."""
 MAX_LOST = 250
-"""Lost frames that are looked for at once, for time and memory; of more every second one comes
-first, or every third, ..."""
+"""Largest number of lost frames in one search, for time and memory; if there are more, every second
+one comes first, or every third, ..."""
 FACTOR_WITHOUT_READOUT = 3.0
-"""Factor on deviations where no readout is known by which the rows could be rectified.
+"""Factor on standard deviations where the readout is unknown, so rows were not rectified.
 Measured on a phone's video with a truth (docs/notebook/photographs.md)."""
 STAGE = "lost frames"
 
 
 class LostFrames:
-    """Frames of a video that have no place, and what is known of the others."""
+    """Lost frames of a video, and the poses of the others."""
 
     def __init__(
         self,
@@ -46,34 +46,34 @@ class LostFrames:
         keyframes: Trajectory,
         seed: int,
     ) -> None:
-        """About what, and how well.
+        """Prepare a search.
 
         Args:
-            video: is read once more.
-            views: how its frames are straightened, where they still bend.
-            trajectory: of all frames.
-            sharp: frames about which the others are looked for, those of them that have a place.
-            keyframes: a frame whose place is not known to a part of their extent stays lost.
-            seed: of the random choices.
+            video: the video, which is read again.
+            views: undistortion of its frames by the final lens.
+            trajectory: poses of all frames.
+            sharp: reference frames; those with a pose are used.
+            keyframes: a frame whose position is uncertain relative to their extent stays lost.
+            seed: seed of the random choices.
         """
-        # A copy, as a source knows how far it has been read.
+        # A copy, as a source keeps its reading position.
         self._video, self._views, self._seed = copy.copy(video), views, seed
         self._most_deviation = MAX_POSITION_DEVIATION * extent_of(keyframes.T_wc)
         self._times = trajectory.timestamps
         states, T_wc = trajectory.states, trajectory.T_wc
         self.known = {k: np.linalg.inv(T_wc[k]) for k in sharp if states[k] == "tracked"}
-        """World to camera of the frames about which they are looked for."""
+        """World-to-camera poses of the reference frames."""
         self.numbers = [k for k, state in enumerate(states) if state != "tracked"]
-        """Which frames have no place, ascending."""
+        """Numbers of the lost frames, ascending."""
 
     @property
     def seconds(self) -> float:
-        """About how long it takes to look for them."""
+        """Approximate time of the search."""
         looked_at = len({*self.numbers, *about(self.numbers, self.known)})
         return looked_at * sum(SECONDS_PER_FRAME.values()) / worker_count()
 
     def search(self, driver: Driver, stopwatch: Stopwatch) -> FoundFrames:
-        """Frames that have a place after all, with what is to be said of it; none where that fails.
+        """Find lost frames, and report the outcome; none where the search fails.
 
         Raises KeyboardInterrupt if it was stopped.
         """
@@ -111,7 +111,7 @@ class LostFrames:
         wanted: Sequence[int],
         report: StageProgress,
     ) -> FoundFrames:
-        """Lost frames that are found about known ones, and known well enough."""
+        """Lost frames found by known ones, with sufficient accuracy."""
         near = about(wanted, known)
         if not near:
             return FoundFrames.none()
@@ -120,14 +120,14 @@ class LostFrames:
         T_cw, view = [known.get(frame.index) for frame in frames], self._views.view
         found = place_lost(frames, T_cw, as_seen(view), self._seed, report)
         times = 1.0 if self._video.shutter.is_told else FACTOR_WITHOUT_READOUT
-        # What a lost frame's lens has of its own turns it: no keyframe tells it.
+        # A lost frame's own lens change acts like a rotation, and is not known from keyframes.
         rotation = np.hypot(times * found.rotation, math.sqrt(2) * view.lens.varies_centre)
         found = replace(found, position=times * found.position, rotation=rotation)
         return found.of(found.position <= self._most_deviation)
 
 
 def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
-    """The known frames that are nearest to any wanted one, before it and after it."""
+    """Known frames nearest to any wanted one, before and after it."""
     near, ascending = set[int](), sorted(known)
     for number in wanted:
         at = bisect_left(ascending, number)
@@ -136,7 +136,7 @@ def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
 
 
 def as_seen(view: StraightView) -> Calibration:
-    """What images are seen by that were taken for those of a pinhole, with what was found since."""
+    """Calibration of the working images, with the distortion that was estimated since."""
     camera, bend = view.seen_by, view.distortion if any(view.distortion) else ()
     return Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, bend, width=camera.width, height=camera.height
@@ -156,7 +156,7 @@ def _read(video: Source, numbers: Collection[int]) -> list[Frame]:
 
 
 def _in_all(report: StageProgress, round: int, rounds: int) -> StageProgress:
-    """Progress of one stage of one round, as one of all of them."""
+    """Map the progress of one stage of one round to that of the whole search."""
     stages = list(SECONDS_PER_FRAME)
 
     def of_all(stage: str, fraction: float) -> None:

@@ -1,4 +1,4 @@
-"""A tracked video; where tracking lost much of it, its frames placed by structure from motion."""
+"""A tracked video, with structure from motion as a fallback where much was lost."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,28 +30,28 @@ if TYPE_CHECKING:
     from geogs.application.structure_from_motion.offline import PlacedOffline
 
 MAX_UNKNOWN = 0.1
-"""Part of the frames without a place from which on structure from motion is tried."""
+"""Fraction of lost frames above which structure from motion is tried."""
 CLEARLY_MORE = 0.05
-"""Part of the frames by which it has to place more than tracking did; a result that is to be relied
-on, where the tracked one is not, need only place as many."""
+"""Fraction of frames that it must locate in addition to tracking; a reliable result, where the
+tracked one is not, need only locate as many."""
 
 
 class TrackedOrPlaced(Work):
-    """A tracked video, or its frames placed by structure from motion where that is clearly better.
+    """A tracked video, or its frames located by structure from motion where that is clearly better.
 
     That is tried after the last frame and the adjustment, before there is a map, where the verdict
-    is that tracking is not reliable, or where many frames have no place. Until it is known
-    to be better, and wherever it fails or is stopped, the tracked result is what is kept.
+    is that tracking is not reliable, or where many frames are lost. Until it is known to be
+    better, and wherever it fails or is stopped, the tracked result is kept.
     """
 
     def __init__(self, tracked: TrackedVideo, opened: Source) -> None:
-        """``opened`` is the video as it came, before the run calibrated it."""
+        """``opened`` is the video before the run's self-calibration."""
         self._tracked, self._opened = tracked, opened
         self._take(tracked)
 
     @property
     def way_on(self) -> str:
-        """How to go on with the tracked video."""
+        """A sentence on how to resume the tracked video."""
         return self._tracked.way_on
 
     def state(self) -> object | None:
@@ -59,9 +59,9 @@ class TrackedOrPlaced(Work):
         return self._tracked.state()
 
     def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
-        """Track; place the frames otherwise if need be; map what is better.
+        """Track; locate the frames by structure from motion if needed; map the better result.
 
-        Raises TrackingLost if no frame could be tracked, nor placed.
+        Raises TrackingLost if no frame could be tracked or located.
         """
         tracked, failure = self._tracked, None
         try:
@@ -79,17 +79,17 @@ class TrackedOrPlaced(Work):
             outcome = Outcome.STOPPED if driver.stop.requested else outcome
         if failure is not None:
             raise failure
-        self._take(tracked)  # whose lens is known by now
+        self._take(tracked)  # with its final lens
         return tracked.map(driver, outcome)
 
     def _judged(self, driver: Driver) -> Verdict | None:
-        """What is to be said of tracking, once lost frames were looked for about what is to be
-        relied on: elsewhere all frames are placed otherwise first."""
+        """Verdict on tracking; for a reliable result, after the search for lost frames. For others,
+        structure from motion of all frames comes first."""
         result = self._result()
         before = result.verdict
         if before is None or not before.is_reliable or not self._find_lost(driver, result):
             return before
-        # The world is as well known as it was; what changes is how many frames have a place.
+        # The accuracy of the world is unchanged; only the number of located frames differs.
         after = self._result().verdict
         assert after is not None
         return replace(before, lost=after.lost, orientation_only=after.orientation_only)
@@ -98,7 +98,7 @@ class TrackedOrPlaced(Work):
         return Result(self._tracked.scene, self._tracked.source)
 
     def _find_lost(self, driver: Driver, result: Result) -> bool:
-        """Place the lost frames that are found about the keyframes; whether there are any."""
+        """Locate lost frames by the keyframes. Returns whether any was found."""
         slam, source, stop = self._tracked.scene, self._tracked.source, driver.stop
         may = self._tracked.metadata.settings.fallback and not source.is_live and has_pycolmap()
         if not may or stop.requested:
@@ -122,7 +122,7 @@ class TrackedOrPlaced(Work):
         self.scene, self.source = work.scene, work.source
 
     def _placed(self, driver: Driver, tracked: Verdict | None) -> "PlacedOffline | None":
-        """The frames placed otherwise, if that can be tried and is better; what is said of it."""
+        """Locate the frames by structure from motion and report it; none if impossible or worse."""
         say, settings = driver.progress.write, self._tracked.metadata.settings
         if not settings.fallback:
             return None
@@ -161,14 +161,14 @@ class TrackedOrPlaced(Work):
         return not rotations_agree(was, placed.trajectory) or has_wrong_joint(was, sharp)
 
     def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
-        """Map the placed frames; false where nothing came of it."""
+        """Map the located frames. Returns false where that fails."""
         if not self._succeeds(driver, lambda: placed.map(driver, checkpoint)):
             return False
         self._take(placed)
         return True
 
     def _succeeds(self, driver: Driver, work: Callable[[], object]) -> bool:
-        """Whether some work ended with something to go on with; else it is said why not."""
+        """Do some work. Returns whether it succeeded; a failure is reported."""
         try:
             if driver.stop.lets_finish(work):
                 return True
@@ -183,27 +183,27 @@ class TrackedOrPlaced(Work):
 
 
 def is_wanted(tracked: Verdict | None) -> bool:
-    """Whether another way to place the frames is worth its time; none where nothing was tracked."""
+    """Whether structure from motion is worth its time; ``tracked`` is none if no frame was."""
     if tracked is None or tracked.is_reliable:
         return _placed_part(tracked) < 1 - MAX_UNKNOWN
-    # As many frames are not reliable either where one lens for all of them is wrong.
+    # As many frames are no more reliable where one lens for all of them is wrong.
     as_many = _is_shape_known(tracked) and not saw_lens_vary(tracked)
     return as_many or _placed_part(tracked) <= 1 - CLEARLY_MORE
 
 
 def saw_lens_vary(tracked: Verdict) -> bool:
-    """Whether tracking followed nearly all of a video, through a lens that changes; what it says of
-    lenses where much was lost is part of that."""
+    """Whether nearly all of a video was tracked, with a lens that changes; where much was lost, its
+    estimate of the lens is part of the failure."""
     return tracked.lens_varies and _placed_part(tracked) >= 1 - MAX_UNKNOWN
 
 
 def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
-    """Whether frames that were placed by structure from motion are to be taken.
+    """Whether the frames located by structure from motion are to be used.
 
-    Their places and depths have to be well known, or no worse than those that were tracked, and
-    they clearly more, or as many and to be relied on where what was tracked is not. Where tracking
-    does not know the depths, as many do not either: its matches are more, and what it says of
-    depths counts what is open of lens and rows, too.
+    Their positions and depths must be accurate, or no worse than the tracked ones, and they must
+    be clearly more, or as many and reliable where tracking is not. Where tracking does not
+    determine the depths, as many are not enough: it has more matches, and its standard deviations
+    of depths include the uncertainty of lens and rows.
     """
     position, depth = MAX_POSITION_DEVIATION, MAX_DEPTH_DEVIATION
     if tracked is not None:
@@ -216,7 +216,7 @@ def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
 
 
 def impossible(settings: RunSettings, source: Source) -> str:
-    """Why the frames of a source cannot be placed once more; empty where they can."""
+    """Reason why the frames cannot be located by structure from motion; empty where they can."""
     if source.is_live:
         return "a live source comes but once; geogs run on its recording would."
     if settings.map is not None:
@@ -227,7 +227,7 @@ def impossible(settings: RunSettings, source: Source) -> str:
 
 
 def _views(slam: Slam) -> FrameViews:
-    """How the frames of a tracked video are straightened, by what the adjustment found."""
+    """Undistortion of a tracked video's frames by the lens of the adjustment."""
     table, camera = slam.world.keyframes, slam.camera
     own = {table[id].frame_index: lens for id, lens in table.frame_lenses.items()}
     lens = slam.lens

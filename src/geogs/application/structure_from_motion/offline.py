@@ -1,4 +1,4 @@
-"""A video without tracking: sharp frames, structure from motion, every frame against the map."""
+"""A video without tracking: structure from motion of sharp frames, localisation of the others."""
 
 import math
 from dataclasses import asdict, replace
@@ -29,32 +29,32 @@ from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
 
 MIN_CLIP_FPS = 8.0
-"""Images a second, as recorded, below which a readout that nobody gave is not searched in clips:
-all images are placed then, and their residuals tell it with its error (docs/photographs.md)."""
+"""Recorded frame rate below which an unknown readout is not estimated from clips: all images are
+located then, and their residuals determine it with its error (docs/photographs.md)."""
 
 
 def offline_config(config: Config) -> ReconstructConfig:
-    """How the map is made of frames that were placed so, with the settings of a run."""
+    """Mapping settings for frames located by structure from motion, from the settings of a run."""
     made = reconstruct_preset(preset_of(config))
     return replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
 
 
 class PlacedOffline(Work):
-    """Sharp frames of a video placed by structure from motion, all others against them.
+    """Sharp frames of a video located by structure from motion, all others against them.
 
-    For a video that tracking cannot follow. The map is that of ``geogs reconstruct`` with the
-    preset of the run, as far as its map is one's; else of its settings input, mesh and seed count.
+    For a video where tracking fails. The map is that of ``geogs reconstruct`` with its preset;
+    of other settings, only input, mesh and seed are used.
     """
 
     scene: "OfflineScene"
-    """The map and all poses, once there are any."""
+    """The map and all poses, once they exist."""
     source: Source
-    """The video, calibrated as soon as its sharp frames have been placed."""
+    """The video, calibrated once its sharp frames are located."""
     trajectory: Trajectory
-    """Poses of all frames, once these have been placed."""
+    """Poses of all frames, once located."""
 
     def __init__(self, config: Config, video: Source, stopwatch: Stopwatch | None = None) -> None:
-        """Settings are those of a run; a ``stopwatch`` may have run before."""
+        """``config`` is that of a run; a ``stopwatch`` may have run before."""
         self._config = offline_config(config)
         self.source = video
         self._stopwatch = stopwatch or Stopwatch()
@@ -62,14 +62,14 @@ class PlacedOffline(Work):
 
     @property
     def stopwatch(self) -> Stopwatch:
-        """Seconds of placing and mapping."""
+        """Seconds of localisation and mapping."""
         return self._stopwatch
 
     def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
-        """Place the frames, then map the sharp ones.
+        """Locate the frames, then map the sharp ones.
 
         Raises:
-            InputError: pycolmap is missing, or the frames do not tell where they were taken.
+            InputError: pycolmap is missing, or the frames do not determine their poses.
             KeyboardInterrupt: it was stopped before there was a map.
         """
         self.choose(driver)
@@ -77,16 +77,16 @@ class PlacedOffline(Work):
         return self.map(driver, checkpoint)
 
     def choose(self, driver: Driver) -> None:
-        """Choose the frames to be placed first. Raises KeyboardInterrupt if it was stopped."""
+        """Select the frames to be located first. Raises KeyboardInterrupt if it was stopped."""
         video = self.source
         with self._stopwatch("choosing frames"):
             self._chosen = choose_frames(video, video.fps, video.length, driver.report)
 
     def place(self, driver: Driver) -> None:
-        """Poses of the chosen frames by structure from motion, of the others against their points.
+        """Locate the selected frames by structure from motion, the others against their points.
 
         Raises:
-            InputError: pycolmap is missing, or the frames do not tell where they were taken.
+            InputError: pycolmap is missing, or the frames do not determine their poses.
             KeyboardInterrupt: it was stopped.
         """
         config, video, chosen = self._config, self.source, self._chosen
@@ -123,27 +123,27 @@ class PlacedOffline(Work):
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
 
     def judged(self) -> Verdict:
-        """How far the poses are to be relied on, once there are some."""
+        """Verdict on the poses, once they exist."""
         scene = self.scene
         return verdict(self.trajectory, scene.keyframe_trajectory(), scene.uncertainty())
 
     def map(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
-        """The map from the sharp frames, once they have been placed.
+        """Make the map from the sharp frames, once they are located.
 
         Raises:
-            InputError: no two of them show the same thing from two places.
+            InputError: no two of them show the same surface from two positions.
             KeyboardInterrupt: it was stopped before there was a map.
         """
         scene = self.scene
         outcome = driver.map_known(scene, lambda: scene.map(driver.report), checkpoint)
-        # Not before, as it would say of which frames the map is to be made.
+        # Not before, as it would determine the frames of the map.
         scene.know(self.trajectory)
         return outcome
 
 
 def beginning_with(video: Source, found: Source) -> Source:
-    """A video with the shutter that was found of it, and the focal length, where nobody gave one:
-    that is where structure from motion begins, which finds its own; see ``MIN_CLIP_FPS``, too."""
+    """A video with the estimated shutter, and focal length where none was given, as the start of
+    structure from motion, which estimates its own; see ``MIN_CLIP_FPS``, too."""
     begun = video if video.recorded_fps < MIN_CLIP_FPS else video.with_shutter(found.shutter)
     if not video.is_calibration_open:
         return begun
@@ -162,20 +162,20 @@ class OfflineScene(Reconstruction):
         super().__init__(camera, config, device)
         self._placed = placed
         self.localised = 0
-        """Frames placed against the points of the others."""
+        """Number of frames localised against the points of the others."""
         self.instead_of = ""
-        """What was said of tracking, where the video was tracked before."""
+        """Verdict on tracking, where the video was tracked before."""
         self.lens_varies = False
-        """Whether tracking saw that: structure from motion has one lens for all frames."""
+        """Whether tracking found a varying lens; structure from motion has one for all frames."""
         self.found = FoundFrames.none()
-        """Frames that were lost, and found once the others had been placed."""
+        """Lost frames that were located after the others."""
 
     def map(self, progress: StageProgress) -> None:
-        """Depths of the sharp frames, and the map from them."""
+        """Search depths of the sharp frames, and make the map from them."""
         self.finish(self._placed.all_points(), progress)
 
     def uncertainty(self) -> Uncertainty:
-        """What the adjustment leaves open."""
+        """Standard deviations by the adjustment."""
         placed = self._placed
         times = placed.timestamps[list(placed.numbers)]
         lens_change = math.inf if self.lens_varies else 0.0
@@ -185,7 +185,7 @@ class OfflineScene(Reconstruction):
         return known.with_found(self.found)
 
     def statistics(self) -> dict[str, object]:
-        """How the poses were found, as nothing was tracked."""
+        """Statistics of structure from motion, as nothing was tracked."""
         return {
             "offline": {
                 "sharp_frames": self._placed.sharp_frames,
@@ -206,7 +206,7 @@ def _place_all(
     config: ReconstructConfig,
     report: StageProgress,
 ) -> list[Float64[Tensor, "4 4"] | None]:
-    """Poses of the frames that find a place; those of structure from motion go to ``scene``."""
+    """Poses of all frames that can be located; those of structure from motion go to ``scene``."""
     localise = localiser(placed, source.camera, config.seed)
     of = dict(zip(placed.numbers, placed.T_cw, strict=True))
     count = len(placed.timestamps)
@@ -225,7 +225,7 @@ def _place_all(
 
 
 def _of_source(source: Source, placed: PlacedVideo) -> Calibration:
-    """The camera that was found, for the images as they came."""
+    """The estimated camera, for the stored images."""
     was = source.calibration
     found = replace(placed.calibration, origin="structure from motion of the video")
     assert was.width is not None

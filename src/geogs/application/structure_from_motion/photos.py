@@ -1,4 +1,4 @@
-"""Structure from motion of photographs and of videos, as another package registers it."""
+"""Structure from motion of photographs and videos, registered by another package."""
 
 import importlib.util
 from collections.abc import Callable, Sequence
@@ -31,10 +31,8 @@ Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 SECONDS_PER_FRAME = {
     "features": 0.1, "choosing pairs": 0.13, "matching": 0.9, "finding poses": 0.25
 }  # fmt: skip
-"""Seconds of one core, by stage, to find where such a frame was taken: some 22 pairs of each are
-matched (50 frames of 512 pixels)."""
-"""Seconds of one core to place another frame against their points, and to take one that has been
-placed into the map."""
+"""Seconds of one core, by stage, to locate a frame: some 22 pairs of each are matched (50 frames of
+512 pixels)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +42,13 @@ class PlacedVideo:
     timestamps: Float64[np.ndarray, "n"]
     """Times of all frames of the video, seconds."""
     sharp_frames: int
-    """How many frames structure from motion was given."""
+    """Number of input frames of structure from motion."""
     numbers: tuple[int, ...]
-    """Which frames of the video have a pose, ascending: the rows of what follows."""
+    """Numbers of the frames with a pose, ascending: the rows of the following arrays."""
     T_cw: Float64[np.ndarray, "m 4 4"]
     """World to camera."""
     deviation: Float64[np.ndarray, "m"]
-    """Standard deviation of the camera's centre after the similarity that fits best; infinite where
+    """Standard deviation of the camera's centre after the best-fitting similarity; infinite where
     unknown."""
     rotation: Float64[np.ndarray, "m"]
     """Standard deviation of its orientation, radians."""
@@ -61,9 +59,9 @@ class PlacedVideo:
     descriptors: tuple[UInt8[np.ndarray, "_k 128"], ...]
     """SIFT descriptors of the same points."""
     calibration: Calibration
-    """Calibration of the frames as they were given."""
+    """Calibration of the input frames."""
     error: float
-    """Mean distance of the points from where they were seen, pixels."""
+    """Mean reprojection error, pixels."""
 
     def all_points(self) -> Float64[np.ndarray, "k 3"]:
         """Every point once."""
@@ -71,7 +69,7 @@ class PlacedVideo:
 
 
 def has_pycolmap() -> bool:
-    """Whether the library that finds where pictures were taken is installed."""
+    """Whether the library for structure from motion is installed."""
     return importlib.util.find_spec("pycolmap") is not None
 
 
@@ -84,20 +82,20 @@ def place_frames(
     seed: int,
     report: StageProgress,
 ) -> PlacedVideo:
-    """Find where frames of one camera were taken; of the largest part that hangs together.
+    """Locate frames of one camera by structure from motion; the largest connected part is kept.
 
     Args:
         chosen: the frames.
-        camera: of the frames; where the search begins if it is not known.
-        is_known: whether the camera is to stay as it is.
-        is_found: whether the video told its focal length before; where another comes out, poses
-            and depths count as unknown.
-        is_rolling: whether rows may have been read one after the other by nobody knows what time.
-        seed: of the random choices.
-        report: follows the work; what it raises ends it.
+        camera: camera of the frames; the initial value if it is not known.
+        is_known: whether the camera is fixed.
+        is_found: whether self-calibration estimated the focal length before; if another one
+            results, poses and depths count as unknown.
+        is_rolling: whether the shutter may be rolling, with unknown readout.
+        seed: seed of the random choices.
+        report: follows the work; an exception ends it.
 
     Raises:
-        InputError: pycolmap is missing, or fewer than three frames hang together.
+        InputError: pycolmap is missing, or fewer than three frames are connected.
     """
     place = _registered("place_frames")
     placed: PlacedVideo = place(chosen, camera, is_known, is_found, is_rolling, seed, report)
@@ -111,14 +109,14 @@ def place_lost(
     seed: int,
     report: StageProgress,
 ) -> FoundFrames:
-    """Find where frames without a pose were taken by others around them, whose poses stay.
+    """Locate frames without a pose by others around them, whose poses are fixed.
 
     Args:
-        frames: those, and others that show the same, in time order.
-        T_cw: their poses, world to camera; none of those to be found.
-        seen_by: the camera of all, with its distortion where they still bend.
-        seed: of the random choices.
-        report: follows the work; what it raises ends it.
+        frames: these, and others of the same scene, in time order.
+        T_cw: their poses, world to camera; none for those to be located.
+        seen_by: the camera of all, with the distortion left in the images.
+        seed: seed of the random choices.
+        report: follows the work; an exception ends it.
 
     Raises:
         InputError: pycolmap is missing.
@@ -128,7 +126,7 @@ def place_lost(
 
 
 def localiser(video: PlacedVideo, camera: Camera, seed: int) -> Localise:
-    """What places any frame of ``camera`` against the points of a placed video.
+    """Function that localises any frame of ``camera`` against the points of a located video.
 
     Raises:
         InputError: pycolmap is missing.
@@ -147,24 +145,24 @@ def open_photographs(
     stop: Stop | None = None,
     seconds: float | None = None,
 ) -> PosedSource:
-    """A source of photographs whose poses are found from themselves, or were found before.
+    """A source of photographs whose poses are estimated from them, or were before.
 
     Args:
         folder: the photographs.
-        config: its ``input`` selects photographs and says what is known of the camera.
+        config: its ``input`` selects photographs and gives the known camera parameters.
         kept: the folder of the result: the poses go to ``sparse/0`` there, as a COLMAP model, and
-            what was left out to ``photographs.json``.
-        hold_out: every so many-th photograph with a pose is left out afterwards; none leaves out
-            none.
-        again: whether to take the poses that were kept there before.
+            a list of left-out photographs to ``photographs.json``.
+        hold_out: every ``hold_out``-th photograph with a pose is left out afterwards; none keeps
+            all.
+        again: whether to reuse the poses stored there before.
         progress: follows the work.
         stop: ends it.
-        seconds: for poses and map together; where they are few the poses take less effort, and
-            ``progress`` hears at once what does not fit. None is no limit.
+        seconds: time for poses and map together; if it is short, the poses take less effort, and
+            ``progress`` reports at once what does not fit. None is no limit.
 
     Raises:
-        InputError: pycolmap is missing, or the photographs do not tell where they were taken.
-        OutputError: the poses cannot be kept.
+        InputError: pycolmap is missing, or the photographs do not determine their poses.
+        OutputError: the poses cannot be written.
         KeyboardInterrupt: it was stopped.
     """
     open_them = _registered("open_photographs")
@@ -174,7 +172,7 @@ def open_photographs(
 
 @dataclass(frozen=True)
 class _PosedView:
-    """An image of a source beside the camera of all."""
+    """An image of a source, with the common camera."""
 
     image: UInt8[np.ndarray, "h w 3"]
     mask: Bool[np.ndarray, "h w"] | None
@@ -185,10 +183,10 @@ class _PosedView:
 def triangulated_points(
     source: PosedSource, which: Sequence[int], seed: int
 ) -> Float64[np.ndarray, "k 3"]:
-    """World points of features of some images of a source, under their poses.
+    """Triangulate features of some images of a source, with their poses.
 
     Raises:
-        InputError: the package for photographs is missing, or no point comes out.
+        InputError: the package for photographs is missing, or no point results.
     """
     images = [source[i] for i in which]
     views = [_PosedView(v.image, v.mask, source.camera, v.T_cw) for v in images]

@@ -1,1 +1,1 @@
-"""A window in the browser on a result, or on a run that is going on: served by viser."""
+"""Viewer in the browser for a result, or for a running run; served by viser."""

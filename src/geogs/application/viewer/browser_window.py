@@ -1,4 +1,4 @@
-"""The page that a viewer serves: the scene on it, and the panel beside that."""
+"""The page that a viewer serves: the scene and the side panel."""
 
 import atexit
 import html
@@ -23,25 +23,25 @@ from geogs.types import MapSnapshot
 
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
 AMBIENT = float(np.pi)
-"""Light by which a rough surface has just its own colours."""
+"""Ambient light for which a rough surface has exactly its own colours."""
 FRUSTA, CAMERA_NOW = 0.01, 0.035
-"""Lengths of frusta as parts of the scene's size."""
+"""Lengths of frusta relative to the scene's size."""
 ROOM, BESIDE = 1.3, 0.1
-"""Distance from which a scene is seen, by that from which it fills a picture, and how far to the
-right of it one looks then, as a part of it."""
+"""Viewing distance relative to that at which the scene fills the picture, and shift of the view to
+the right as a fraction of it."""
 _FAREWELL = 0.3
-"""Seconds that the server takes to end."""
+"""Seconds for the server to end."""
 _MIN_MOVE = 1e-3
-"""Change of a number of its pose from which a keyframe is moved."""
+"""Least change of an entry of a keyframe's pose for which it is moved."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 """Parts of the scene, by the names of their switches."""
 
 
 class Window:
-    """A page at ``address`` with a scene and a panel; nobody has to look at it."""
+    """A page at ``address`` with a scene and a panel, with or without clients."""
 
     def __init__(self, title: str, host: str, port: int, with_disks: bool = False) -> None:
-        """Begin to serve; ``with_disks`` shows these, too, from the beginning.
+        """Begin to serve; ``with_disks`` shows the disks from the beginning.
 
         Raises:
             InputError: viser is not installed, or is one that cannot be guarded.
@@ -71,51 +71,51 @@ class Window:
 
     @property
     def clients(self) -> int:
-        """How many look."""
+        """Number of connected clients."""
         return len(self._server.get_clients())
 
     @property
     def layer(self) -> Layer:
-        """The layer that was asked for."""
+        """The selected layer."""
         layer: Layer = self._layer.value
         return layer
 
     def on_layer(self, act: Callable[[], None]) -> None:
-        """Do something whenever another layer is asked for."""
+        """Call ``act`` whenever another layer is selected."""
         self._layer.on_update(lambda _: act())
 
     def add_checkbox(self, name: str, value: bool) -> Any:
-        """Another switch, whose ``value`` says how it stands."""
+        """Add a checkbox; ``value`` is its state."""
         return self._server.gui.add_checkbox(name, value)
 
     def add_slider(self, name: str, last: int, act: Callable[[int], None]) -> None:
-        """A slider over numbers from 1."""
+        """Add a slider over numbers from 1."""
         slider = self._server.gui.add_slider(name, 1, max(last, 2), 1, 1)
         slider.on_update(lambda _: act(min(int(slider.value), last)))
 
     def stop(self) -> None:
-        """No longer serve."""
+        """Stop the server."""
         atexit.unregister(self.stop)
-        with redirect_stdout(StringIO()):  # its thread says that it has ended
+        with redirect_stdout(StringIO()):  # its thread prints that it has ended
             self._server.stop()
             time.sleep(_FAREWELL)
 
     def say(self, heading: str, *sentences: str) -> None:
-        """The words at the top of the panel: text, whatever stands in it."""
+        """Set the text at the top of the panel; HTML in it is escaped."""
         words = [f"<strong>{html.escape(heading)}</strong>", *map(html.escape, sentences)]
         self._words.content = "".join(f'<p style="margin: 0.4em 1em">{w}</p>' for w in words if w)
 
     def show_picture(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-        """The picture of the panel."""
+        """Set the picture of the panel."""
         self._picture.image = picture
 
     def stand_upright(self, up: Float[np.ndarray, "3"], size: float) -> None:
-        """Turn this direction of the scene up; frusta are drawn for a scene of this size."""
+        """Set the up direction of the scene, and the size that frusta are drawn for."""
         self._size = size
         self._server.scene.set_up_direction(tuple(up))
 
     def look_from(self, start: StartView, up: Float[np.ndarray, "3"]) -> None:
-        """Where those who look, and who come later, stand first."""
+        """Set the start view of present and future clients."""
 
         # The panel covers the right of the window, which may be narrow besides.
         away = ROOM * (start.eye - start.target)
@@ -131,7 +131,7 @@ class Window:
             look(client)
 
     def follow(self, T_wc: Float[np.ndarray, "4 4"]) -> None:
-        """Bring all who look behind a camera."""
+        """Move the view of all clients behind a camera."""
         eye = T_wc[:3, 3] - T_wc[:3, :3] @ np.array([0.0, 0.25, 0.6]) * self._size
         target = T_wc[:3, 3] + 0.5 * self._size * T_wc[:3, 2]
         for client in self._server.get_clients().values():
@@ -139,17 +139,17 @@ class Window:
                 _look(client, eye, target, -T_wc[:3, 1])
 
     def show_mesh(self, mesh: Mesh) -> None:
-        """A surface in its colours."""
+        """Show a surface in its colours."""
         if mesh.colours is None:
             mesh = replace(mesh, colours=np.full((len(mesh.vertices), 3), 200, np.uint8))
         shown = mesh.creased()
         shape = glb(shown.vertices, shown.faces, shown.normals, shown.colours, ONE_SIDED)
-        # The file is turned by half a turn about x.
+        # The file is rotated by 180 degrees about x.
         turned = {"wxyz": (0.0, 1.0, 0.0, 0.0), "cast_shadow": False, "receive_shadow": False}
         self._put("Mesh", self._server.scene.add_glb("/mesh", shape, **turned))
 
     def show_disks(self, disks: MapSnapshot) -> None:
-        """Disks, coloured by where they face."""
+        """Show disks, coloured by their normals."""
         from geogs.geometry.lie import quaternion_to_matrix
 
         R = quaternion_to_matrix(disks.quaternion).cpu().numpy()
@@ -167,7 +167,7 @@ class Window:
         self._put("Disks", splats)
 
     def show_path(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """The path of the camera."""
+        """Show the path of the camera."""
         if len(points) < 2:
             return
         ends = np.stack([points[:-1], points[1:]], 1).astype(np.float32)
@@ -183,7 +183,7 @@ class Window:
         camera: Camera,
         image: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> None:
-        """A frustum; one that is there already follows a correction."""
+        """Show a keyframe's frustum, or move an existing one after a correction."""
         if id not in self._frusta:
             frustum = self._frustum(f"/keyframes/{id}", T_wc, camera, FRUSTUM, FRUSTA, image)
             self._parts["Keyframes"].append(frustum)
@@ -201,7 +201,7 @@ class Window:
         camera: Camera,
         image: UInt8[np.ndarray, "h w 3"] | None,
     ) -> None:
-        """Where the camera is now, or the keyframe that was chosen."""
+        """Show the frustum of the present camera, or of the selected keyframe."""
         self._frustum("/camera", T_wc, camera, NOW, CAMERA_NOW, image)
 
     def _frustum(
@@ -241,13 +241,13 @@ class Window:
 
 
 def reduced(picture: UInt8[np.ndarray, "h w 3"], longest: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Every so many-th pixel of a picture, so that no side is longer."""
+    """Subsample a picture so that no side is longer than ``longest``."""
     step = -(-max(picture.shape[:2]) // longest)
     return np.ascontiguousarray(picture[::step, ::step])
 
 
 def _look(client: Any, eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
-    """Move the camera of somebody who looks."""
+    """Move the view of a client."""
     client.camera.up_direction = up
     client.camera.position = eye
     client.camera.look_at = target

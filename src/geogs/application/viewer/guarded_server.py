@@ -1,7 +1,7 @@
-"""A server of viser that answers those alone who know its address, which holds a secret.
+"""A viser server that answers only requests with a secret token in the address.
 
-viser itself serves everybody who reaches the port, and any page that is open in a browser may
-connect to it from there, whatever its origin.
+viser itself serves every client that reaches the port, and any page that is open in a browser can
+connect to it, whatever its origin.
 """
 
 import hmac
@@ -17,7 +17,7 @@ from geogs.errors import InputError
 
 
 class GuardedServer:
-    """A server at ``http://host:port/token/``; everything else is refused there."""
+    """A server at ``http://host:port/token/``; all other requests are refused."""
 
     def __init__(self, host: str, port: int, title: str) -> None:
         """Begin to serve.
@@ -43,7 +43,7 @@ class GuardedServer:
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Inside, servers of the library below viser, which has no way to say it, are guarded."""
+        """Guard servers of the library below viser in the block; viser has no option for it."""
         from websockets.asyncio import server
 
         serve = server.serve
@@ -60,7 +60,7 @@ class GuardedServer:
             yield
 
     def _checked(self, connection: Any, request: Any, process_request: Any) -> Any:
-        """The answer to a request: that of viser where the token and the origin are right."""
+        """Answer a request: by viser if the token and the origin are right, else by refusal."""
         path, question, query = request.path.partition("?")
         token, _, rest = path.removeprefix("/").partition("/")
         origin = request.headers.get("Origin")

@@ -1,4 +1,4 @@
-"""A window on a run that is going on, which it may not hold up."""
+"""Live viewer of a run, which must not slow it down."""
 
 import threading
 import time
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
     from geogs.slam import Slam
 
 MAX_TIME_FRACTION = 0.02
-"""Fraction of the time that looking may take, of the run's thread and of the viewer's together."""
+"""Largest fraction of the time for the viewer, in the run's thread and its own together."""
 MAX_DISKS = 30_000
 _MAP_SECONDS = 3.0
-"""Least time between two looks at the map."""
+"""Least time between two copies of the map."""
 _PICTURE_EDGE = 320
 
 
 @dataclass(frozen=True)
 class Update:
-    """What there is to see at a moment; nothing in it changes any more."""
+    """Immutable state of a run for display."""
 
     words: tuple[str, str]
     picture: UInt8[np.ndarray, "h w 3"] | None
     camera: Camera
     T_wc: Float[np.ndarray, "4 4"] | None
-    """Pose of the camera now; none while it is not known."""
+    """Present camera pose, camera to world; none while it is not known."""
     keyframe_ids: tuple[int, ...]
     keyframes: Float[np.ndarray, "k 4 4"]
     """Camera to world."""
     disks: MapSnapshot | None = None
-    """Disks of the map; none where they are as before."""
+    """Disks of the map; none where they are unchanged."""
 
 
 class LiveViewer(RunObserver):
     """Shows a run in a window, by a thread of its own.
 
-    What comes while that is at work, or while it has used up its fraction of the time, is dropped.
+    Updates that come while it is busy, or has used up its fraction of the time, are dropped.
     """
 
     def __init__(self, window: Window, max_fraction: float = MAX_TIME_FRACTION) -> None:
@@ -59,13 +59,13 @@ class LiveViewer(RunObserver):
         self._ended = False
         self._start = time.perf_counter()
         self.used = 0.0
-        """Seconds of computing that looking has taken, of both threads."""
+        """CPU time of the viewer in seconds, of both threads."""
         self._last_map = -_MAP_SECONDS
         self._thread = threading.Thread(target=self._serve, name="viewer", daemon=True)
         self._thread.start()
 
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
-        """Take what there is to see, if there is time for it."""
+        """Take an update, if there is time for it."""
         now = time.perf_counter()
         if self._next is not None or self.used > self._max_fraction * (now - self._start):
             return
@@ -91,7 +91,7 @@ class LiveViewer(RunObserver):
 
     def _look(self, frame: Frame, status: "PoseEstimate", slam: "Slam", now: float) -> Update:
         ids = tuple(slam.segments.keyframe_ids)
-        # The table keeps places of keyframes that another thread may be removing.
+        # The table keeps poses of keyframes that another thread may be removing.
         T_wc = [np.linalg.inv(slam.world.keyframes.poses[i].numpy()) for i in ids]
         seen = slam.T_cw if status.state.value == "tracking" else None
         loops = len(slam.world.loops.loops)
@@ -149,7 +149,7 @@ class LiveViewer(RunObserver):
 
 
 def thinned(disks: MapSnapshot) -> MapSnapshot:
-    """Every so many-th disk, so that no more are left than can be sent."""
+    """Subsample the disks to the number that can be sent."""
     step = -(-len(disks) // MAX_DISKS)
     kept = {name: getattr(disks, name)[::step].cpu() for name in MapSnapshot.__slots__}
     return replace(disks, **kept)

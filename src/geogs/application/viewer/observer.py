@@ -1,4 +1,4 @@
-"""Who looks on while a run goes on."""
+"""Observers of a run."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 class RunObserver:
-    """Looks on and changes nothing; this one does not even look. Override what you want to see.
+    """Observes a run without changing it; this one does nothing. Override its methods.
 
-    The run waits for each of these calls, so they should be quick: take what is needed, and do the
-    work elsewhere.
+    The run waits for each of these calls, so they should be quick: copy the data, and do the work
+    elsewhere.
     """
 
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
@@ -26,17 +26,17 @@ class RunObserver:
 
 
 class Observers(RunObserver):
-    """Several who look on, one after the other."""
+    """Several observers, called one after the other."""
 
     def __init__(self, several: Sequence[RunObserver]) -> None:
         self._several = several
 
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
-        """Tell each of them."""
+        """Forward the call to each observer."""
         for observer in self._several:
             observer.frame(frame, status, slam)
 
     def result(self, result: "Result") -> None:
-        """Tell each of them."""
+        """Forward the call to each observer."""
         for observer in self._several:
             observer.result(result)

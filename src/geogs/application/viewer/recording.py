@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from geogs.slam import Slam
 
 _EVERY = 5
-"""Keyframes between two records of the map and of the path."""
+"""Interval of records of the map and the path, in keyframes."""
 _QUALITY = 70
 """Quality of the JPEG images."""
 
 
 class Recorder(RunObserver):
-    """Writes image and camera at every new keyframe, now and then path and disks, and last the
-    mesh; times are those of the frames."""
+    """Writes image and camera at every new keyframe, path and disks at intervals, and the mesh at
+    the end; times are those of the frames."""
 
     def __init__(self, path: Path) -> None:
         """Begin a recording.
@@ -48,7 +48,7 @@ class Recorder(RunObserver):
         self._keyframes = 0
 
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
-        """Record what a new keyframe changed."""
+        """Record the changes of a new keyframe."""
         seen = slam.T_cw
         if seen is None or status.keyframes <= self._keyframes:
             return
@@ -75,7 +75,7 @@ class Recorder(RunObserver):
             self._log_map(slam)
 
     def result(self, result: "Result") -> None:
-        """Record path and mesh as they came out, and close the file."""
+        """Record the final path and mesh, and close the file."""
         rerun, stream = self._rerun, self._stream
         path = result.trajectory.T_wc[result.trajectory.tracked, :3, 3]
         stream.log("world/path", rerun.LineStrips3D([path], colors=[(242, 163, 58)]))

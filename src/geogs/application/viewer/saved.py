@@ -1,4 +1,4 @@
-"""A window on a saved result."""
+"""Viewer of a saved result."""
 
 import threading
 
@@ -12,7 +12,7 @@ from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.pages.run_pictures import layer_picture
 
 MAX_FRUSTA = 24
-"""Most keyframes shown, evenly along the path."""
+"""Largest number of keyframes shown, evenly along the path."""
 _IMAGE_EDGE = 160
 
 
@@ -51,7 +51,7 @@ def _show_keyframes(result: SavedResult, window: Window) -> None:
 
 
 class _Inspector:
-    """Shows the keyframe that was chosen, in the layer that was chosen."""
+    """Shows the selected keyframe in the selected layer."""
 
     def __init__(self, result: SavedResult, window: Window) -> None:
         self._result, self._window = result, window
@@ -59,7 +59,7 @@ class _Inspector:
         self._lock = threading.Lock()
 
     def begin(self) -> None:
-        """Put up the slider and show the first keyframe."""
+        """Add the slider and show the first keyframe."""
         count = len(self._result.keyframes)
         if not count:
             return
@@ -73,7 +73,7 @@ class _Inspector:
         self._show()
 
     def _show(self) -> None:
-        # Depth is rendered from the disks when it is asked for: one at a time.
+        # Depth is rendered from the disks on demand: one at a time.
         with self._lock:
             result, number = self._result, self._number
             views = result.views

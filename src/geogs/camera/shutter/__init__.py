@@ -1,6 +1,6 @@
-"""The rolling shutter: how fast the camera turns while it reads an image row by row.
+"""The rolling shutter: rotation of the camera while it reads an image row by row.
 
-A row is seen at its own time. Each image is brought to the time of its middle row by rotation
-alone, with the angular velocity that the video itself shows; the readout is given by the user or
-found in the video.
+Each row has its own time. Each image is rectified to the time of its middle row by rotation alone,
+with the angular velocity estimated from the video; the readout is given by the user or estimated
+from the video.
 """

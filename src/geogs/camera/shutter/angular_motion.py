@@ -1,4 +1,4 @@
-"""How a camera turns while it reads one image."""
+"""Rotation of a camera while it reads one image."""
 
 from dataclasses import dataclass, field
 
@@ -10,8 +10,8 @@ from jaxtyping import Float
 class AngularMotion:
     """Angular velocity around the time of the middle row, in axes of the camera.
 
-    A point that the camera has at X then, it has at ``Exp(rate t + acceleration t^2 / 2) X`` after
-    ``t`` seconds, as far as the camera only turns.
+    A point at X in the camera then is at ``Exp(rate t + acceleration t^2 / 2) X`` after ``t``
+    seconds, as far as the camera only rotates.
     """
 
     rate: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -19,24 +19,24 @@ class AngularMotion:
     acceleration: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Radians per second squared."""
     parallax: Float[np.ndarray, "gh gw 2"] | None = None
-    """Parallax, which each thing has by its own depth: x/z and y/z per second at the cells of
-    a grid that covers the image; none where nothing is known."""
+    """Parallax, by the depth of each point: x/z and y/z per second at the cells of a grid that
+    covers the image; None where unknown."""
 
     def angles(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-        """Rotation vectors after seconds from the middle row."""
+        """Return the rotation vectors at times in seconds from the middle row."""
         t = times[:, None]
         return t * self.rate + 0.5 * t * t * self.acceleration
 
     @property
     def is_still(self) -> bool:
-        """Whether it does not turn at all."""
+        """Whether it does not rotate at all."""
         return not (self.rate.any() or self.acceleration.any())
 
 
 def rotated(
     vectors: Float[np.ndarray, "n 3"], by: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Each vector turned by its own rotation vector, radians."""
+    """Rotate each vector by its own rotation vector, radians."""
     from geogs.camera.shutter.turning_kernels import turn
 
     turned = np.empty((len(vectors), 3))
@@ -57,9 +57,9 @@ class AngularStep:
 
 
 def angular_motion_between(before: AngularStep | None, after: AngularStep | None) -> AngularMotion:
-    """The turning at an image from the steps to it and from it; none where one is not known.
+    """Return the motion at an image from the steps to it and from it, either of which may be None.
 
-    A mean rate is taken for the rate in the middle of its step; between two it is linear.
+    The mean rate is assumed for the middle of its step; between the two middles it is linear.
     """
     if before is None or after is None:
         known = before or after

@@ -1,4 +1,4 @@
-"""The angular motion at each image of a video, from its flow to the images beside it."""
+"""Angular motion at each image of a video, from its flow to the neighbouring images."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Image(Protocol):
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"] | None:
-        """RGB, of the camera whose angular motion is asked for; none if it could not be read."""
+        """RGB, of the camera whose motion is estimated; None if it could not be read."""
         ...
 
 
@@ -38,18 +38,18 @@ def with_angular_motion(
     wanted: Callable[[int], bool],
     each: Each = map,
 ) -> Iterator[tuple[Picture, AngularMotion]]:
-    """Images whose position is wanted, each with how the camera turned then.
+    """Yield the wanted images, each with the angular motion of the camera.
 
-    What is given depends on an image and its two neighbours alone, so it is the same wherever
-    reading begins.
+    The result depends on an image and its two neighbours alone, so it is the same wherever reading
+    begins.
 
     Args:
         images: neighbours in the video.
         camera: that took them.
         readout: seconds from the first to the last row.
-        wanted: says of positions 0, 1, 2, ... whether the image is to be given.
-        each: how flow is measured of one pair of neighbours after the other; with ``map`` one image
-            more than the one that is given has been read by then.
+        wanted: whether the image at position 0, 1, 2, ... is wanted.
+        each: maps flow measurement over pairs of neighbours; with ``map`` one image more than the
+            one yielded has been read by then.
     """
     meter = FlowMeter(camera)
 
@@ -70,7 +70,7 @@ def with_angular_motion(
 
 @dataclass(frozen=True)
 class _Seen(Generic[Picture]):
-    """An image, the small one that flow is measured on, and whether its turning is asked for."""
+    """An image, its small version for flow, and whether its motion is wanted."""
 
     image: Picture
     small: UInt8[np.ndarray, "h w"] | None
@@ -80,7 +80,7 @@ class _Seen(Generic[Picture]):
 def _neighbours(
     images: Iterable[Picture], meter: FlowMeter, wanted: Callable[[int], bool]
 ) -> Iterator[tuple[_Seen[Picture], _Seen[Picture] | None]]:
-    """Each image with the next; the last one alone."""
+    """Yield each image with the next; the last one alone."""
     last: _Seen[Picture] | None = None
     for position, image in enumerate(images):
         small = None if image.image is None else meter.small(image.image)

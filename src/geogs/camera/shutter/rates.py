@@ -1,4 +1,4 @@
-"""The angular velocity of a camera between two images of a video, from their flow."""
+"""Angular velocity of a camera between two images of a video, from their flow."""
 
 import threading
 from dataclasses import dataclass, replace
@@ -11,16 +11,16 @@ from geogs.camera.shutter.angular_motion import rotated
 from geogs.camera.shutter.rolling_camera import RollingCamera
 
 LONG_EDGE = 256
-"""Pixels, at most, of the images that flow is measured on."""
+"""Largest long edge, in pixels, of the images for flow."""
 STEP = 8
-"""Pixels of these between two cells."""
+"""Pixels of these images between two cells."""
 BORDER = 2
-"""Flow that ends nearer to the border, in pixels, is not used."""
+"""Pixels from the border within which flow ends are not used."""
 TOLERANCE = 0.004
 """Radians by which a cell may differ from rotation before it loses half of its weight."""
 ROUNDS = 10
 SMOOTH = 1.0
-"""Cells, standard deviation of the mean that parallax is smoothed by."""
+"""Standard deviation of the smoothing of parallax, in cells."""
 AGREEING = 0.2
 """Fraction of the cells that have to agree with the rotation within twice the tolerance."""
 
@@ -32,7 +32,7 @@ class RayFlow:
     first: Float[np.ndarray, "n 3"]
     """Unit vectors in the first camera."""
     second: Float[np.ndarray, "n 3"]
-    """The same in the second."""
+    """Unit vectors in the second camera."""
     first_time: Float[np.ndarray, "n"]
     """Readouts from the middle row of the first image to the row of the cell."""
     second_time: Float[np.ndarray, "n"]
@@ -40,16 +40,16 @@ class RayFlow:
     inside: Bool[np.ndarray, "n"]
     """Whether the flow ends within the second image."""
     ends: Float[np.ndarray, "n 2"]
-    """Pixels of the small second image."""
+    """End positions, in pixels of the small second image."""
     shape: tuple[int, int]
-    """Lines and columns of the cells."""
+    """Rows and columns of the cells."""
 
 
 class FlowMeter:
     """Measures flow between images of one camera, in any thread."""
 
     def __init__(self, camera: RollingCamera) -> None:
-        """``camera`` of the images that :meth:`small` is given."""
+        """``camera``: that of the images passed to :meth:`small`."""
         full = camera.camera
         small = full if full.long_edge <= LONG_EDGE else full.with_long_edge(LONG_EDGE)
         self._size = (small.width, small.height)
@@ -62,14 +62,14 @@ class FlowMeter:
         self._of_thread = threading.local()
 
     def small(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
-        """The grey image that flow is measured on."""
+        """Return the small grey image for flow."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if (grey.shape[1], grey.shape[0]) == self._size:
             return grey
         return cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
 
     def measure(self, first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> RayFlow:
-        """Flow from one small image to another."""
+        """Measure flow from one small image to another."""
         # OpenCV's own has buffers that two threads cannot share.
         if not hasattr(self._of_thread, "dis"):
             self._of_thread.dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -86,13 +86,13 @@ class FlowMeter:
 def angular_velocity(
     flow: RayFlow, interval: float, readout: float
 ) -> Float[np.ndarray, "3"] | None:
-    """Mean radians per second between the middle rows of two images, in axes of the camera.
+    """Estimate mean radians per second between the middle rows of two images, in camera axes.
 
     The rotation that most cells agree on, by iteratively reweighted least squares (Cauchy's
-    weights, Procrustes' rotation), compiled. Each round has a closed solution, so that nothing is
-    linearised and the least-squares loop has no part in it. A point is seen in other rows of the
-    two images, hence after more or less than the interval: its rays are moved to the times of the
-    middle rows by the velocity itself.
+    weights, Procrustes' rotation), compiled. Each round has a closed-form solution, so the common
+    least-squares loop is not used. A point lies in different rows of the two images, so the time
+    between is more or less than the interval: its rays are moved to the times of the middle rows by
+    the velocity itself.
 
     Args:
         flow: from the first image to the second.
@@ -100,7 +100,7 @@ def angular_velocity(
         readout: seconds from the first to the last row.
 
     Returns:
-        the velocity; none where too few cells agree with any.
+        the velocity; None where too few cells agree.
     """
     from geogs.camera.shutter.turning_kernels import turning_between
 
@@ -116,11 +116,10 @@ def angular_velocity(
 def parallax(
     flow: RayFlow, rate: Float[np.ndarray, "3"], interval: float, readout: float
 ) -> tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]]:
-    """Motion of the cells beside a rotation, in the first image and propagated to the second.
+    """Return the motion of the cells beyond a rotation, in the first image and moved to the second.
 
-    The translation of the camera, each cell at its own depth, and what moves by itself. It is
-    smoothed over the cells around, by their median and a mean, and where nothing is known it comes
-    from the surroundings.
+    It is due to the camera's translation, by the depth of each cell, and to moving objects. It is
+    smoothed over neighbouring cells, by a median and a mean, and filled in from them where unknown.
 
     Args:
         flow: from the first image to the second.
@@ -152,7 +151,7 @@ def parallax(
 def _spread(
     field: Float[np.ndarray, "gh gw 2"], known: Bool[np.ndarray, "n"], cells: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "gh gw 2"]:
-    """Means of those values that are known around each cell, once each lies at its own cell."""
+    """Move each value to its cell, then average the known values around each cell."""
     shape, count = field.shape[:2], len(cells)
     values = (known, *(known * part for part in field.reshape(-1, 2).T))
     laid = (np.bincount(cells, part, count).reshape(shape) for part in values)

@@ -1,4 +1,4 @@
-"""The readout of a rolling shutter as the video tells it, and when it is believed."""
+"""Readout of a rolling shutter estimated from the video, and conditions for its acceptance."""
 
 import math
 from dataclasses import dataclass
@@ -6,38 +6,37 @@ from dataclasses import dataclass
 import numpy as np
 
 LONGEST, SHORTEST = 0.036, 0.002
-"""Seconds of a readout that is believed; less is nothing to care about."""
+"""Longest and shortest accepted readout, seconds; a shorter one does not matter."""
 LEAST_EVIDENCE = 4.0
-"""Standard errors by which the readout differs from a global shutter's."""
+"""Least readout that is accepted, in standard errors."""
 
 
 @dataclass(frozen=True)
 class FoundReadout:
-    """The readout of a video, as far as the video tells it."""
+    """Readout estimated from a video."""
 
     best: float = 0.0
-    """Readout at which the matches fit best, believed or not, seconds."""
+    """Readout at which the matches fit best, accepted or not, seconds."""
     error: float = math.inf
-    """Standard error of the best, seconds; infinite where the video does not tell."""
+    """Standard error of the best, seconds; infinite where the video does not determine it."""
 
     @property
     def is_believed(self) -> bool:
-        """Whether the video says that its shutter rolls."""
+        """Whether a rolling shutter is accepted."""
         is_clear = self.best >= max(LEAST_EVIDENCE * self.error, SHORTEST)
         return is_clear and self.best - self.error <= LONGEST
 
     @property
     def readout(self) -> float:
-        """Seconds; 0 where no other is believed."""
+        """Accepted readout, seconds; 0 if none is accepted."""
         return min(self.best, LONGEST) if self.is_believed else 0.0
 
     @property
     def left_open(self) -> float:
-        """Root mean square of what the readout may differ by from the one that counts, seconds.
+        """Root mean square error of ``readout``, seconds.
 
-        Where it counts as 0, by Bayes' rule: before the video was asked, every second shutter
-        rolls, as likely in any time from ``SHORTEST`` to ``LONGEST`` as in another. Where the video
-        says nothing, that is 15 ms.
+        Where none is accepted, by Bayes' rule: a priori every second shutter rolls, with a readout
+        uniform from ``SHORTEST`` to ``LONGEST``. Without any data, that is 15 ms.
         """
         if self.is_believed:
             return self.error

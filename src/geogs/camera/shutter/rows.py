@@ -1,4 +1,4 @@
-"""Where the pixels of a rectified image lie in the image of a rolling shutter."""
+"""Positions of the pixels of a rectified image in the image of a rolling shutter."""
 
 import cv2
 import numpy as np
@@ -14,25 +14,25 @@ from geogs.types import SeenRows
 CELL = 8
 """Pixels between two nodes; offsets are interpolated between them."""
 ROUNDS = 3
-"""The row decides the time, the time decides the row: an error shrinks some 50 times a round."""
+"""Rounds of the fixed point of row and time: an error shrinks some 50 times a round."""
 
 
 def node_count(pixels: int) -> int:
-    """Nodes along so many pixels."""
+    """Return the number of nodes along so many pixels."""
     return -(-pixels // CELL) + 2
 
 
 class RowOffsets:
-    """Offsets of the pixels of a rectified image in the rolling one, since the camera moves.
+    """Offsets of the pixels of a rectified image in the rolling one, due to camera motion.
 
-    The rectified image is what a pinhole with a global shutter would see at the time of the middle
-    row. A distant point at ray r is seen by the rolling camera where ``Exp(angles(t)) r`` projects
-    with its lens, at the time t of the very row that it is projected to.
+    The rectified image is that of a pinhole with a global shutter at the time of the middle row.
+    The rolling camera sees a distant point at ray r where ``Exp(angles(t)) r`` projects through its
+    lens, at the time t of the row that it projects to.
     """
 
     def __init__(self, rolling: RollingCamera, rectified: Camera) -> None:
         self._rolling, self._rectified = rolling, rectified
-        # A cell more on every side, so that all pixels lie between nodes.
+        # One more cell on every side, so that all pixels lie between nodes.
         columns = (np.arange(node_count(rectified.width)) - 1) * CELL + (CELL - 1) / 2
         lines = (np.arange(node_count(rectified.height)) - 1) * CELL + (CELL - 1) / 2
         self._shape = (len(lines), len(columns))
@@ -43,7 +43,7 @@ class RowOffsets:
         self._still = rolling.pixels(self._rays)
 
     def nodes(self, motion: AngularMotion, readout: float) -> Float[np.ndarray, "n 2"]:
-        """Offsets in pixels of the rolling image at the nodes, row by row.
+        """Return offsets in pixels of the rolling image at the nodes, row by row.
 
         Args:
             motion: of the camera, at this image.
@@ -52,7 +52,7 @@ class RowOffsets:
         pixels, velocity = self._still, None
         if motion.parallax is not None:
             velocity = self._sampled(motion.parallax)
-            # What the rate's change within a readout leaves of the rotation is not parallax.
+            # The part due to the rate's change within a readout is not parallax.
             error = abs(readout) * np.linalg.norm(motion.acceleration)
             square = (velocity**2).sum(1, keepdims=True)
             velocity *= square / np.maximum(square + error**2, 1e-12)
@@ -65,7 +65,7 @@ class RowOffsets:
         return pixels - self._still
 
     def _sampled(self, field: Float[np.ndarray, "gh gw 2"]) -> Float[np.ndarray, "n 2"]:
-        """A field over the cells of the image, at the nodes."""
+        """Interpolate a field over the cells of the image at the nodes."""
         lines, columns = field.shape[:2]
         camera = self._rolling.camera
         size = np.array([camera.width, camera.height]) / [columns, lines]
@@ -77,7 +77,7 @@ class RowOffsets:
         return values[:, 0].astype(np.float64)
 
     def dense(self, nodes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "h w 2"]:
-        """Offsets at every pixel of the rectified image from those at the nodes."""
+        """Interpolate the offsets at the nodes at every pixel of the rectified image."""
         width, height = self._rectified.width, self._rectified.height
         size = (CELL * self._shape[1], CELL * self._shape[0])
         laid = nodes.astype(np.float32).reshape(*self._shape, 2)
@@ -85,11 +85,11 @@ class RowOffsets:
         return dense[CELL : CELL + height, CELL : CELL + width]
 
     def seen(self, nodes: Float[np.ndarray, "n 2"], shutter: Shutter) -> SeenRows:
-        """Offsets and times at which a rectified image, made with such offsets, was seen.
+        """Return offsets and times of the pixels of an image rectified with these offsets.
 
         Args:
             nodes: offsets in pixels of the rolling image at the nodes.
-            shutter: the one that they are for.
+            shutter: their shutter.
         """
         pixels, target = self._still + nodes, self._rectified
         rays = self._rolling.rays(pixels)

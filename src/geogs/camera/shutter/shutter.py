@@ -16,13 +16,13 @@ class Shutter:
     readout: float = 0.0
     """Seconds; 0 is a global shutter, negative where the last line is read first."""
     origin: str = "taken for a global shutter"
-    """Where that comes from, for the log and ``intrinsics.json``."""
+    """Source of the readout, for the log and ``intrinsics.json``."""
     error: float = 0.0
-    """Standard error where the video gave it, or left it open, seconds; 0 where it was told."""
+    """Standard error if estimated from the video or undetermined, seconds; 0 if given."""
 
     @property
     def is_told(self) -> bool:
-        """Whether the video showed it or somebody said it, if only that it is global."""
+        """Whether the shutter, even a global one, was estimated or given."""
         return self.readout != 0 or (self.error == 0 and self != Shutter())
 
     def __post_init__(self) -> None:

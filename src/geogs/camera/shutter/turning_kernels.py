@@ -1,8 +1,8 @@
-"""Compiled loops over the rays of a camera that turns; they release the interpreter lock.
+"""Compiled loops over the rays of a rotating camera; they release the interpreter lock.
 
-Rows of frames are rectified beside tracking. Hundreds of steps of NumPy a frame, each of which may
-give the lock away and has to wait for it again, hold that up longer than their arithmetic takes.
-Arrays are written by element: products, rows and sums of NumPy take numba seconds to compile.
+Rows of frames are rectified in parallel to tracking. Hundreds of NumPy calls a frame, each of which
+may release the lock and wait for it again, would take longer than their arithmetic. Arrays are
+written by element: products, rows and sums of NumPy take numba seconds to compile.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ _EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
 _SMALL = 1e-4
 """Radians below which sine and cosine are taken from their series, exact to 1e-16 there."""
 _POLAR = 30
-"""Steps to the nearest rotation, at most; ten are usual."""
+"""Most iterations to the nearest rotation; ten are usual."""
 
 
 @njit(**_EXACT)
 def turn(vectors, by, out):
-    """Vectors (n, 3), each turned by a rotation vector of its own (n, 3), into ``out``.
+    """Rotate each vector (n, 3) by its own rotation vector (n, 3), into ``out``.
 
     Source: Rodrigues' formula.
     """
@@ -38,7 +38,7 @@ def turn(vectors, by, out):
 
 @njit(**_EXACT)
 def nearest_turn(matrix):
-    """Make a matrix (3, 3) the rotation nearest to it; whether its determinant is positive.
+    """Replace a matrix (3, 3) by the nearest rotation; return whether its determinant is positive.
 
     Source: the polar decomposition by Newton's iteration (Higham 1986).
     """
@@ -72,7 +72,7 @@ def nearest_turn(matrix):
 
 @njit(**_EXACT)
 def turning_between(first, second, first_time, second_time, inside, interval, tolerance, rounds):
-    """The rate of the rotation between two images that most rays agree on.
+    """Estimate the rotation rate between two images that most rays agree on.
 
     Args:
         first, second: rays (n, 3) in either camera.
@@ -80,10 +80,10 @@ def turning_between(first, second, first_time, second_time, inside, interval, to
         inside: 1 for rays that count, 0 for others (n).
         interval: seconds between the middle rows.
         tolerance: radians at which a ray loses half of its weight.
-        rounds: of reweighting.
+        rounds: number of reweightings.
 
     Returns:
-        the rate (3), radians per second, and by how much each ray differs from it (n), radians.
+        the rate (3), radians per second, and the residual of each ray (n), radians.
     """
     rate, moment, weight = np.zeros(3), np.empty((3, 3)), inside.copy()
     a, b, error = np.empty_like(first), np.empty_like(second), np.empty_like(weight)

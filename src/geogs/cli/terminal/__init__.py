@@ -1,1 +1,1 @@
-"""The terminal that a command is given: signals, keys, streams, words."""
+"""The terminal of a command: signals, keys, streams, messages."""

@@ -1,4 +1,4 @@
-"""What the ``geogs`` command changes of the process it has to itself, and why.
+"""Changes that the ``geogs`` command makes to its own process, with reasons.
 
 A program that imports geogs keeps its own state: none of this is done for it.
 """
@@ -16,18 +16,18 @@ from geogs.application.interrupt import handled_signals, interrupt
 from geogs.cli.terminal.streams import make_unbreakable
 
 _IMPORTED = 500_000
-"""Objects, more than the imports of a run make: 330,000, and with SciPy and Numba 450,000."""
+"""Number of objects above that of a run's imports: 330,000, with SciPy and Numba 450,000."""
 
 
 def take_over() -> None:
     """Make the process ready for a command, before anything heavy is imported.
 
-    NumPy's BLAS gets one thread, since our own threads use the cores. Those of BLAS spin while they
-    wait for each other, for matrices that are small here: the search for a readout took eight times
-    as long on 64 cores as on 16, and on two a third longer than with one thread.
+    NumPy's BLAS gets one thread, since our own threads use the cores. Its threads spin while they
+    wait for each other, for small matrices: the search for a readout took eight times as long on
+    64 cores as on 16, and on two a third longer than with one thread.
 
-    SIGTERM, by which systems and schedulers end programs, and SIGHUP are taken as Ctrl-C: results
-    so far are kept. Streams that are closed, full or gone end no command.
+    SIGTERM, of systems and schedulers, and SIGHUP act like Ctrl-C: results so far are kept.
+    Streams that are closed, full or gone end no command.
     """
     _handle_signals(interrupt)
     _leave_imports_alone()
@@ -36,10 +36,10 @@ def take_over() -> None:
 
 
 def _leave_imports_alone() -> None:
-    """Look for garbage only among what is made after the imports.
+    """Limit garbage collection to objects made after the imports.
 
-    Modules stay; to go through them again and again takes a sixth of the time of importing them,
-    and later holds up a frame now and then.
+    Modules stay; scanning them repeatedly takes a sixth of the import time, and later delays some
+    frames.
     """
     usual = gc.get_threshold()
 
@@ -54,9 +54,9 @@ def _leave_imports_alone() -> None:
 
 
 def show_warnings() -> None:
-    """Let the library's warnings appear on the standard error, one line each.
+    """Show the library's warnings on the standard error, one line each.
 
-    A log that can no longer be written, as on a full disk, ends nothing and says nothing.
+    A log that can no longer be written, as on a full disk, is ignored silently.
     """
     import logging
 
@@ -70,10 +70,10 @@ def show_warnings() -> None:
 
 
 def leave(code: int) -> None:
-    """End the process where PyTorch was loaded, once what was registered for its end is done.
+    """End the process at once if PyTorch was loaded, after its exit functions.
 
-    Taking modules and a GPU's memory apart, which the system takes back anyway, lasts a second.
-    Signals end it at once, without a word.
+    Freeing modules and a GPU's memory, which the system takes back anyway, takes a second. Signals
+    end it at once, without a message.
     """
     _handle_signals(signal.SIG_DFL)
     if "torch" in sys.modules:

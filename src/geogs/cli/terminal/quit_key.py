@@ -1,4 +1,4 @@
-"""The key q, which ends a live run as Ctrl-C does."""
+"""The key q, which ends a live run like Ctrl-C."""
 
 import os
 import select
@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 PAUSE = 0.2
-"""Seconds between two looks at whether anybody listens still."""
+"""Interval of checks whether to stop listening, in seconds."""
 
 
 @contextmanager
 def quit_key(stop: Callable[[], None]) -> Iterator[bool]:
-    """While it is entered, ``stop`` is called when q is pressed; gives whether keys can be heard.
+    """Call ``stop`` when q is pressed in the block; yields whether keys can be read.
 
-    They cannot where standard input is no terminal. It is as it was afterwards.
+    They cannot if standard input is no terminal. Its mode is restored afterwards.
     """
     try:
         keys = sys.stdin.fileno()

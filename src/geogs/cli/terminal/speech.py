@@ -1,4 +1,4 @@
-"""What a command says while it works and at its end."""
+"""Messages of a command during its work and at its end."""
 
 import logging
 import sys
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 
 
 NOT_JUDGED = "Reliability unknown: the run was interrupted before the final adjustment."
-"""Said of a run that was stopped."""
+"""Message for an interrupted run."""
 
 
 def say_loading(options: Verbosity) -> None:
-    """A word on a terminal before what takes seconds to load; the first news writes over it."""
+    """Show a loading message on a terminal; the first progress report overwrites it."""
     if not options.quiet and sys.stderr is not None and sys.stderr.isatty():
         print("loading ...", end="\r", file=sys.stderr, flush=True)
 
 
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "Result":
-    """Do the work of a command, with a line of progress on the standard error, and say at its end
-    on the standard output what came of it.
+    """Do the work of a command, with a line of progress on the standard error, and print the
+    closing message on the standard output.
 
     Raises:
-        TrackingLost: there is no mesh in the end, of a work that nobody stopped; the rest is kept.
+        TrackingLost: uninterrupted work ended without a mesh; the other files are kept.
     """
     from geogs.application.progress.terminal_progress import TerminalProgress
 
@@ -54,7 +54,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "
 
 
 def _remedy(options: Verbosity, result: "Result") -> list[str]:
-    """The command that may help where a run came to its end and is not reliable."""
+    """Suggested command, where a finished run is not reliable."""
     from geogs.application.remedy import remedy
 
     if not isinstance(options, RunSettings) or result.is_interrupted:
@@ -64,7 +64,7 @@ def _remedy(options: Verbosity, result: "Result") -> list[str]:
 
 
 def closing_message(result: "Result", seconds: float) -> list[str]:
-    """Lines for the user after a run or a reconstruction, which took so many seconds."""
+    """Closing lines after a run or a reconstruction, which took ``seconds``."""
     from geogs.evaluation.duration import duration
     from geogs.io.sources.posed.posed_source import PosedSource
 

@@ -1,4 +1,4 @@
-"""Standard streams that never end a command: closed, full, of another encoding, or gone."""
+"""Standard streams that never end a command, even if closed, full, gone, or wrongly encoded."""
 
 import io
 import os
@@ -8,11 +8,11 @@ from typing import TextIO
 
 
 def make_unbreakable() -> None:
-    """Replace the streams of the process by ones that drop what can no longer be written.
+    """Replace the streams of the process by ones that drop output that cannot be written.
 
-    Numbers 0 to 2 that are closed are opened to nowhere first, so that no file of a result gets
-    one of them, and with it what some library prints. Characters that a terminal does not know are
-    written as escapes. Streams that somebody else has put in place stay.
+    Closed descriptors 0 to 2 are opened to the null device first, so that no file of a result gets
+    one of them, and with it the output of libraries. Characters unknown to a terminal are written
+    as escapes. Streams that were replaced already stay.
     """
     for number in range(3):
         try:
@@ -27,7 +27,7 @@ def make_unbreakable() -> None:
 
 
 class _Dropping(io.RawIOBase):
-    """Writes to a descriptor; what that does not take is lost."""
+    """Writes to a descriptor; output that fails is lost."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -54,6 +54,6 @@ def _unbreakable(number: int, before: TextIO | None) -> TextIO:
     with suppress(OSError, ValueError):
         if before is not None:
             before.flush()
-    # Of its own: what decoders print is caught by leading the number elsewhere meanwhile.
+    # A duplicate: decoder noise is caught by redirecting the original number meanwhile.
     buffer = io.BufferedWriter(_Dropping(os.dup(number)))
     return io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=True)

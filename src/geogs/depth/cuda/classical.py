@@ -141,7 +141,7 @@ class CudaDepthEngine:
         return farther_surface(depth, reach)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
-        """The images on the GPU, brought there at their first use."""
+        """The images on the GPU, uploaded at their first use."""
         return self._images.get(view.id, partial(self._bring, view))
 
     def _bring(self, view: DepthView) -> KeyframeImages:

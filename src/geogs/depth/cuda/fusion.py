@@ -54,7 +54,7 @@ def vote(
     keep = torch.empty(len(points), dtype=torch.bool, device=device)
     votes = torch.zeros(len(points), 2, dtype=torch.int32, device=device)
     for start in range(0, len(depths), VOTERS_TOGETHER):
-        batch = list(depths[start : start + VOTERS_TOGETHER])  # the kernel reads where they lie
+        batch = list(depths[start : start + VOTERS_TOGETHER])  # keeps what the kernel reads
         T_cw = np.stack([d.T_cw for d in batch])
         matrices = upload(packed(T_cw[:, :3, :3], T_cw[:, :3, 3]), device)
         maps, skies = (upload(a, device) for a in (_addresses(batch), _skies(batch)))
@@ -68,14 +68,14 @@ def vote(
 
 
 def _addresses(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n 2"]:
-    """Where each depth and confidence lies; kernels of this stream may read there from now on."""
+    """Addresses of each depth and confidence; kernels of this stream may read them from now on."""
     maps = [(d.depth.depth, d.depth.confidence) for d in depths]
     assert all(a.is_contiguous() and b.is_contiguous() for a, b in maps)
     return np.array([(a.data_ptr(), b.data_ptr()) for a, b in maps], np.int64)
 
 
 def _skies(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n"]:
-    """Where each sky lies; 0 where there is none."""
+    """Address of each sky mask; 0 where there is none."""
     skies = [d.depth.sky for d in depths]
     assert all(s is None or s.is_contiguous() for s in skies)
     return np.array([0 if s is None else s.data_ptr() for s in skies], np.int64)

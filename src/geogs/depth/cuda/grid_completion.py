@@ -18,7 +18,7 @@ _PANEL = 8
 
 
 def _window(minors: int) -> int:
-    """Rows of the band matrix worked on at a time, for lines of so many cells."""
+    """Rows of the band matrix worked on at a time, for lines of ``minors`` cells."""
     return -(-2 * minors // _PANEL) * _PANEL + _PANEL
 
 
@@ -43,8 +43,8 @@ def complete(
 ) -> Float32[Tensor, "k 3 gh gw"]:
     """Completed inverse depth, ``prior_weight`` and ``relative_precision`` of some keyframes.
 
-    From the tracker's inverse depth, its information and the weights of smoothness; ``typical`` is
-    the median of each keyframe's known inverse depths.
+    ``grids`` hold the tracker's inverse depth, its information and the weights of smoothness;
+    ``typical`` is the median of each keyframe's known inverse depths.
     """
     count, _, gh, gw = grids.shape
     by_columns = gh <= gw

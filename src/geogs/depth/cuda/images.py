@@ -51,5 +51,5 @@ def image_pixels(view: DepthView) -> Float32[np.ndarray, "n"]:
 def packed(
     A: Float64[np.ndarray, "n 3 3"], b: Float64[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 12"]:
-    """Each matrix, row by row, and the vector that goes with it, as the kernels take them."""
+    """The rows of each matrix, then its vector, as the kernels take them."""
     return np.concatenate([A.reshape(-1, 9), b], 1).astype(np.float32)

@@ -32,11 +32,11 @@ class PlaneSlots:
     per: int
     """Planes in each of the 32 lanes."""
     count: int
-    """Planes."""
+    """Number of planes."""
     first: float
     """Smallest inverse depth."""
     spacing: float
-    """Between the inverse depths of two planes."""
+    """Difference of inverse depth between neighbouring planes."""
 
     @staticmethod
     def of(planes: Float32[np.ndarray, "p"], device: torch.device) -> "PlaneSlots":
@@ -61,7 +61,7 @@ class SweptDepth:
     margin: Float32[Tensor, "h w"]
     planes: PlaneSlots
     costs: Float32[Tensor, "h w s"]
-    """One value a slot."""
+    """Cost of each slot's plane."""
 
 
 def match_planes(

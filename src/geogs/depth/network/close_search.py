@@ -1,7 +1,7 @@
 """The second search: a few depths in every cell at 1/2, near those of the planes at 1/4.
 
-Around an edge a coarse cell shows two surfaces. So the depths on either side and the second mode of
-the planes are tried beside the cell's own, and one of them is chosen, not their mean.
+At an edge a coarse cell shows two surfaces. So the depths on either side and the second mode of the
+planes are tried beside the cell's own, and one of them is chosen, not their mean.
 """
 
 from dataclasses import dataclass
@@ -33,13 +33,13 @@ class PlaneModes:
     first: Float[Tensor, "b h w"]
     """Mean around the likeliest plane."""
     second: Float[Tensor, "b h w"]
-    """The same around the likeliest of the others."""
+    """Mean around the likeliest of the other planes."""
     probability: Float[Tensor, "b h w"]
-    """Of the first mode."""
+    """Probability of the first mode."""
 
 
 def plane_modes(logits: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d"]) -> PlaneModes:
-    """The two likeliest depths of a distribution over planes: a mean over all of them would hang
+    """The two likeliest depths of a distribution over planes: a mean over all of them would lie
     between two surfaces."""
     p = logits.softmax(1)
     place = torch.arange(p.shape[1], device=p.device)[:, None, None]
@@ -81,7 +81,7 @@ def chosen(
     log_depth: Float[Tensor, "b d h w"],
     step: Float[Tensor, "b"],
 ) -> Float[Tensor, "b h w"]:
-    """Softmax mean of the depths that are of one surface with the likeliest."""
+    """Softmax mean of the depths that are of the same surface as the likeliest."""
     best = log_depth.gather(1, logits.argmax(1, keepdim=True))
     beside = (log_depth - best).abs() <= ONE_SURFACE * step[:, None, None, None]
     weight = logits.softmax(1) * beside
@@ -94,5 +94,5 @@ def _peak(p: Float[Tensor, "b d h w"]) -> Tensor:
 
 
 def _twice(x: Float[Tensor, "b h w"]) -> Float[Tensor, "b h2 w2"]:
-    """Every cell four times."""
+    """Repeat every cell 2 x 2 times."""
     return x.repeat_interleave(2, 1).repeat_interleave(2, 2)

@@ -1,4 +1,4 @@
-"""From plane scores to depth, its deviation, and normals."""
+"""Decoder from plane scores to depth, its deviation, and normals."""
 
 import itertools
 import math
@@ -31,7 +31,7 @@ _LIKELY = -3.0
 
 
 class VolumeNetwork(nn.Module):
-    """A U-Net over the plane scores, its channels, with the context at every scale."""
+    """A U-Net with the plane scores as channels and the context at every scale."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class DepthReadout(nn.Module):
         self.normal = nn.Sequential(Block(wide + 5, wide), nn.Conv2d(wide, 4, 1))
         self.to_full = nn.Sequential(Block(wide, wide), nn.Conv2d(wide, 36, 1))
         for head in (self.depth, self.normal):
-            for parameter in head[-1].parameters():  # at first, what was chosen
+            for parameter in head[-1].parameters():  # at first, no change of the choice
                 nn.init.normal_(parameter, std=1e-3)
 
     def forward(
@@ -157,14 +157,14 @@ def bounded(raw: Tensor) -> Tensor:
 
 
 def concentration(raw: Tensor) -> Tensor:
-    """Positive, 2 for a raw 0, growing like an exponential that is bent to its bound."""
+    """Positive concentration, logistic in ``raw``: 2 for 0, bounded by ``MOST_CONCENTRATION``."""
     return (MOST_CONCENTRATION / (1 + (MOST_CONCENTRATION / 2 - 1) * (-raw).exp())).clamp_min(1e-2)
 
 
 def facing(
     vector: Float[Tensor, "b 3 h w"], rays: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, "b 3 h w"]:
-    """Unit vectors; the part along the ray of those that would face away is cut (after DSINE)."""
+    """Unit vectors; those that face away lose their part along the ray first (after DSINE)."""
     ray = functional.normalize(rays, dim=1)
     away = (vector * ray).sum(1, keepdim=True)
     bent = vector - (away + 0.02).clamp_min(0) * ray

@@ -12,7 +12,7 @@ TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class DepthCalibration:
-    """Parameters fitted on rooms that the training did not show."""
+    """Parameters fitted on rooms that were not in the training."""
 
     scale: float = 1.0
     """Factor on Laplace scales."""
@@ -35,6 +35,6 @@ class DepthCalibration:
 def right_logit(
     log_scale: Float[Tensor, "*n"], outlier: Float[Tensor, "*n"]
 ) -> Float[Tensor, "*n"]:
-    """Logit of the chance that a depth is right by the network's distribution."""
+    """Logit of the chance, by the network's distribution, that a depth is right."""
     inside = 1 - (-TOLERANCE * (-log_scale).exp()).exp()
     return torch.logit((-outlier).sigmoid() * inside, 1e-4)

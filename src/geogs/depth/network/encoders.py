@@ -61,7 +61,7 @@ class ContextEncoder(nn.Module):
 
 
 def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Images less the mean of each colour, over the contrast of all."""
+    """Images minus the mean of each colour, divided by the contrast of all."""
     centred = images - images.mean((2, 3), keepdim=True)
     return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
 

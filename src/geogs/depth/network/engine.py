@@ -36,14 +36,14 @@ EDGE = 512
 MOST_NEIGHBOURS = 8
 """Most neighbours, as in the training; the best are used."""
 MOST_ANGLE = math.radians(15)
-"""Expected error of a normal from which it is unknown."""
+"""Expected error above which a normal counts as unknown."""
 _EDGE = 0.02
 """Relative difference to the nearest pixel's depth above which an interpolated depth lies between
 two surfaces."""
 
 
 class NetworkDepthEngine(AlternativeSearch):
-    """Finds depths, normals and confidence by the network where there are neighbours.
+    """Estimates depths, normals and confidence by the network where there are neighbours.
 
     Images of the ``resident`` keyframes used last stay on the device.
     """
@@ -74,8 +74,8 @@ class NetworkDepthEngine(AlternativeSearch):
 
     @torch.no_grad()
     def _warm_up(self) -> None:
-        """Run the network on a black image, so that the first keyframe need not wait a second for
-        cuDNN to be loaded and to choose its kernels. Failures are reported at the first use."""
+        """Run the network on a black image, so that the first keyframe does not wait a second for
+        cuDNN to load and to choose its kernels. Failures are reported at the first use."""
         stream = torch.cuda.Stream(self.device)
         with contextlib.suppress(RuntimeError), torch.cuda.stream(stream):
             black = torch.zeros(1, 3, self.seen.height, self.seen.width, device=self.device)
@@ -139,7 +139,7 @@ class NetworkDepthEngine(AlternativeSearch):
         )
 
     def _image(self, view: DepthView) -> UInt8[Tensor, "h w 3"]:
-        """The keyframe's image at the network's size, brought to the device at its first use."""
+        """The keyframe's image at the network's size, uploaded at its first use."""
         size = (self.seen.width, self.seen.height)
 
         def bring() -> Tensor:
@@ -149,7 +149,7 @@ class NetworkDepthEngine(AlternativeSearch):
         return self._images.get(view.id, bring)
 
     def _at_render(self, found: DepthPrediction) -> tuple[Tensor, Tensor, Tensor]:
-        """Depth over the typical depth, confidence, and normals at the size of the render."""
+        """Depth relative to the typical depth, confidence, and normals at the render size."""
         confidence = self.network.calibration.confidence(found.log_scale, found.outlier)
         known = 2 / found.concentration < MOST_ANGLE
         normal = found.normal * known[:, None]

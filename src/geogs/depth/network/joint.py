@@ -13,17 +13,17 @@ from geogs.depth.depth_view import DenseDepth, dense_depths
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""
 MEAN, CHOICE = (45.0, 0.63, 0.16, 0.35), (12.0, 0.55, 0.52, 0.5)
-"""Coefficients of the logits of the network's weight in the mean, and of the chance that of two
-depths its is right: of the images' vote, of the logits of the search's confidence, which counts
-against it, and of its own, and a constant. What minimises the mean of log(1 + (error / 0.5 %)²),
-and a logistic regression, on eight rooms and streets."""
+"""Coefficients of two logits: of the network's weight in the mean, and of the chance that its depth
+is the right one. They multiply the images' vote, the logit of the search's confidence (subtracted)
+and that of the network's; the last is a constant. MEAN minimises the mean of
+log(1 + (error / 0.5 %)²), CHOICE is a logistic regression, on eight rooms and streets."""
 AGREE, DIFFER = (0.74, 0.53, 0.28), (0.35, 0.17, 0.41, -0.54)
 """Coefficients of the logit of the chance that the result is right to 2 %. Where both agree: of the
-larger and the smaller of their logits, and a constant; where not: of the logits of what was chosen
-and of the other, of the choice, and a constant. Logistic regressions as well, the first on eight
-keyframes of four rooms."""
+larger and the smaller of their logits, and a constant; where not: of the logits of the chosen depth
+and of the other, of the size of the choice's logit, and a constant. Logistic regressions as well,
+the first on eight keyframes of four rooms."""
 BOUND = 0.02
-"""Distance of a confidence from 0 and 1 that its logit has at least."""
+"""Least distance of a confidence from 0 and 1 where its logit is taken."""
 
 
 class JointDepthEngine(AlternativeSearch):
@@ -50,15 +50,16 @@ class JointDepthEngine(AlternativeSearch):
 
 
 def agreement(first: DenseDepth, second: DenseDepth) -> Bool[Tensor, "h w"]:
-    """Where both depths are of one surface."""
+    """Whether both depths of each pixel are of one surface."""
     return (first.depth.log() - second.depth.log()).abs() < REACH
 
 
 def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) -> DenseDepth:
-    """One depth of two; normals are the second's.
+    """Join two depths; normals are the second's.
 
-    Where they agree it is a mean of their logarithms, elsewhere the likelier one; both by their
-    confidences and the ``vote`` of the images, the first one's ``photo_costs`` less the second's.
+    Where they agree the result is a mean of their logarithms, elsewhere the likelier one. Both
+    depend on the confidences and the images' ``vote``: the first one's ``photo_costs`` minus the
+    second's.
     """
     logs = torch.stack([first.depth, second.depth]).log()
     confidence = torch.stack([first.confidence, second.confidence])
@@ -79,5 +80,5 @@ def speaks_for_second(
     vote: Float[Tensor, "*n"],
     logit: Float[Tensor, "2 *n"],
 ) -> Float[Tensor, "*n"]:
-    """The logit of what speaks for the second of two depths, of the logits of their confidences."""
+    """Logit in favour of the second of two depths, given the logits of their confidences."""
     return by[0] * vote - by[1] * logit[0] + by[2] * logit[1] + by[3]

@@ -20,7 +20,7 @@ class Norm(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         b, c, h, w = x.shape
         weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
-        # Autocast would make a float32 image of every one that is normalised.
+        # Autocast would convert every normalised image to float32.
         return torch.native_group_norm(
             x.contiguous(), weight, bias, b, c, h * w, self.groups, 1e-5
         )[0]
@@ -40,7 +40,7 @@ class Block(nn.Sequential):
 
 
 class Residual(nn.Module):
-    """Two convolutions beside a shortcut."""
+    """Residual block: two convolutions and a shortcut."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -63,8 +63,8 @@ def upsampled(
     """Twice the resolution: each fine cell is a convex combination of the nine coarse ones around.
 
     ``logits`` are those of the nine cells, row by row, for each of the four fine cells of a cell.
-    Those whose first number differs by more than ``gap`` from that of the likeliest do not
-    count, so that nothing is averaged across an edge.
+    Cells whose first number differs by more than ``gap`` from that of the likeliest do not
+    count, so nothing is averaged across an edge.
     """
     b, c, h, w = x.shape
     padded = functional.pad(x, (1, 1, 1, 1), mode="replicate")

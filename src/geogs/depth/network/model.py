@@ -26,7 +26,7 @@ from geogs.depth.network.volume import PlaneVolume
 from geogs.networks.tensor_files import load_trained
 
 MULTIPLE = 32
-"""Pixels; images are padded to a multiple."""
+"""Images are padded to a multiple of this, pixels."""
 
 
 class DepthNetwork(nn.Module):
@@ -40,7 +40,7 @@ class DepthNetwork(nn.Module):
         super().__init__()
         self.options = options or DepthNetworkOptions()
         self.calibration = calibration or DepthCalibration()
-        """Of deviations and confidences; not trained with the network."""
+        """Calibration of deviations and confidences; not trained with the network."""
         self.matching = MatchingEncoder(self.options)
         self.context = ContextEncoder(self.options)
         self.volume = PlaneVolume(self.options)
@@ -69,7 +69,7 @@ class DepthNetwork(nn.Module):
 
 
 def load_depth_network(path: Path) -> DepthNetwork:
-    """The network of a weights file; raises InputError where it is missing or another's."""
+    """Load the network of a weights file; raises InputError if that is missing or another's."""
 
     def build(about: dict[str, Any]) -> DepthNetwork:
         calibration = DepthCalibration(**about["calibration"])
@@ -85,7 +85,7 @@ def _padded(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h2 w2"]:
 
 
 def _cropped(found: DepthPrediction, height: int, width: int) -> DepthPrediction:
-    """The pixels of the image; what is at 1/2 and 1/4 keeps its padding."""
+    """Crop maps to the image; those at 1/2 and 1/4 keep their padding."""
     if found.log_depth.shape[-2:] == (height, width):
         return found
     names = ("log_depth", "log_scale", "outlier", "normal", "concentration")

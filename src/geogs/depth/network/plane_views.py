@@ -13,20 +13,19 @@ from torch.nn import functional
 CELL = 4
 """Pixels per cell of the coarse features; cell i covers the pixels 4 i to 4 i + 3."""
 LEAST_Z = 0.02
-"""Depth in a neighbour, over the typical depth, below which nothing is seen."""
+"""Depth in a neighbour, relative to the typical depth, below which nothing is seen."""
 
 
 @dataclass(frozen=True)
 class TriedDepths:
-    """Depths that are tried in every cell of keyframes; logarithms are of depth over the typical
-    one."""
+    """Depths tried in every cell of keyframes; logarithms are of depth over the typical depth."""
 
     log_depth: Float[Tensor, "b d #p"]
-    """The same for all cells where they are planes."""
+    """Logarithms of depth; the same for all cells if they are planes."""
     label: Float[Tensor, "b d"]
-    """Input of the network for each."""
+    """Network input for each depth."""
     step: Float[Tensor, "b"]
-    """About the difference from one to the next."""
+    """Approximate difference from one to the next."""
     cell: int = CELL
     """Pixels per cell."""
 
@@ -41,13 +40,13 @@ class PlaneViews:
     """The cells of keyframes, at every depth tried, in one neighbour each."""
 
     cells: Float[Tensor, "b d p 2"]
-    """x, y among the neighbour's cells."""
+    """Position x, y in the neighbour, cells."""
     seen: Bool[Tensor, "b d p"]
-    """Before the camera and in the image."""
+    """Whether it is in front of the camera and in the image."""
     log_z: Float[Tensor, "b d p"]
     """Logarithm of the depth in the neighbour."""
     angle: Float[Tensor, "b d p"]
-    """Between the two rays, radians."""
+    """Angle between the two rays, radians."""
     log_step: Float[Tensor, "b d p"]
     """Logarithm of the pixels that a cell moves from this depth to the next."""
 
@@ -87,8 +86,8 @@ def see_planes(
 ) -> PlaneViews:
     """Cells at these depths in a neighbour of ``height`` x ``width`` cells.
 
-    ``T`` takes points of the keyframe's camera to the neighbour's; its translation is over the
-    typical depth.
+    ``T`` takes points of the keyframe's camera to the neighbour's; its translation is divided by
+    the typical depth.
     """
     rotated = T[:, :3, :3] @ rays
     z = tried.log_depth.exp()[:, None]

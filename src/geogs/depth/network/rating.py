@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 MULTIPLE = 8
-"""Rows of what the first layer sees are padded to a multiple of so many, as matrix units like."""
+"""The first layer's inputs are padded to a multiple of this many rows, which suits matrix units."""
 
 
 def rate_planes(

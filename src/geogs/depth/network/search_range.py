@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 RATIO = (6.0, 60.0)
-"""Bounds of far over near."""
+"""Bounds of the ratio of far to near."""
 _FEW = 8
 """Least number of known depths."""
 _BEYOND = 2.0
@@ -20,7 +20,7 @@ class SearchRange:
     near: float
     far: float
     typical: float
-    """About the median."""
+    """Approximate median depth."""
 
 
 def search_range(
@@ -28,11 +28,11 @@ def search_range(
     own: Float[np.ndarray, "m"],
     limits: tuple[float, float] | None = None,
 ) -> SearchRange:
-    """The range of a keyframe.
+    """Search range of a keyframe.
 
-    ``seen`` are the known inverse depths of what it sees, of all views, ``own`` its own, of which
-    the typical depth is the median. ``limits``, the nearest and farthest depth where they are
-    given, may exceed ``RATIO``.
+    ``seen`` are the known inverse depths in its view, from all views; ``own`` are its own, whose
+    median gives the typical depth. ``limits``, the nearest and farthest depth if they are given,
+    may exceed ``RATIO``.
     """
     if limits is not None:
         near, far = limits

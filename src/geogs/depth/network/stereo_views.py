@@ -22,7 +22,7 @@ class StereoViews:
     """fx fy cx cy of the keyframe in pixels, pixel centres at integers."""
     other_intrinsics: Float[Tensor, "b k 4"]
     T_nk: Float[Tensor, "b k 4 4"]
-    """Takes points of the keyframe's camera to the neighbours'."""
+    """Transformation from the keyframe's camera to the neighbours'."""
     valid: Bool[Tensor, "b k"]
     """False for neighbours that only fill the batch."""
     near: Float[Tensor, "b"]
@@ -30,7 +30,7 @@ class StereoViews:
     far: Float[Tensor, "b"]
     """Farthest depth to search."""
     typical: Float[Tensor, "b"]
-    """About the median depth."""
+    """Approximate median depth."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class DepthPrediction:
     """Prediction for keyframes; logarithms are of depth over ``typical``."""
 
     log_depth: Float[Tensor, "b h w"]
-    """Mean of every pixel."""
+    """Mean logarithm of depth of every pixel."""
     log_scale: Float[Tensor, "b h w"]
     """Logarithm of the Laplace scale of the logarithm of depth of inliers."""
     outlier: Float[Tensor, "b h w"]
-    """Logit of the probability that it is an outlier, anywhere in the range."""
+    """Logit of the probability that a pixel is an outlier, anywhere in the range."""
     normal: Float[Tensor, "b 3 h w"]
     """Unit, camera frame, facing the camera."""
     concentration: Float[Tensor, "b h w"]
@@ -54,11 +54,11 @@ class DepthPrediction:
     tried: Float[Tensor, "b e h2 w2"]
     """The depths tried at 1/2, as ``log_depth``."""
     tried_logits: Float[Tensor, "b e h2 w2"]
-    """Their logits."""
+    """Logits of the depths tried at 1/2."""
     plane_logits: Float[Tensor, "b d h4 w4"]
     """Logits of the planes at 1/4."""
     plane_scores: Float[Tensor, "b d h4 w4"]
-    """The same from the neighbours' features alone."""
+    """Scores of the planes from the neighbours' features alone."""
     log_planes: Float[Tensor, "b d"]
     """Logarithms of the planes' depths over ``typical``."""
 

@@ -29,7 +29,7 @@ def normals_of(
 def _halved(difference: Tensor, dim: int) -> Tensor:
     """Central differences per step; those of the border span one step only."""
     factor = torch.full((difference.shape[dim],), 0.5, device=difference.device)
-    factor[:1].fill_(1.0)  # no number may come from the host: this is recorded on a GPU
+    factor[:1].fill_(1.0)  # no number may come from the host: a CUDA graph records this
     factor[-1:].fill_(1.0)
     shape = [1] * difference.dim()
     shape[dim] = -1

@@ -1,4 +1,4 @@
-"""Scores of each depth in each cell of a keyframe, over all neighbours by visibility."""
+"""Scores of each depth in each cell of a keyframe, over all neighbours, weighted by visibility."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +16,7 @@ from geogs.depth.network.rating import rate_planes
 from geogs.depth.network.stereo_views import StereoViews
 
 VOXEL, PIXEL, PLANE = 4, 3, 3
-"""Inputs beside the correlations of a plane in a cell; of a cell; of a plane in a view."""
+"""Numbers of inputs: of a plane in a cell beside correlations, of a cell, of a plane in a view."""
 MOST_LOGIT = 10.0
 """Bound of the logarithm of a view's weight."""
 
@@ -24,7 +24,7 @@ MOST_LOGIT = 10.0
 class PlaneScorer(nn.Module):
     """Rates every plane of every cell in one neighbour: a score and its weight.
 
-    A small network sees the correlations and what geometry says: whether, how obliquely and how
+    Inputs of a small network are the correlations and the geometry: whether, how obliquely and how
     near the point is seen and how far it moves from plane to plane (after SimpleRecon's metadata).
     """
 
@@ -62,7 +62,7 @@ class PlaneScorer(nn.Module):
 
 
 class PlaneVolume(nn.Module):
-    """Scores of all depths that are tried over all neighbours."""
+    """Scores of all tried depths, combined over all neighbours."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Depths beside an edge moved to the farther surface where the images agree better there."""
+"""Revision of depths beside an edge: the farther surface where images agree better with it."""
 
 from collections.abc import Sequence
 
@@ -12,9 +12,9 @@ from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 from geogs.geometry.jumps import minmod_slopes
 
 MIN_GAP = 0.03
-"""Relative difference of inverse depth from which a pixel around is of a farther surface."""
+"""Relative difference of inverse depth from which a nearby pixel is of a farther surface."""
 REACH = 0.019
-"""Distance within which it is looked for, in long edges of the image: 6 pixels of 320."""
+"""Distance within which it is searched, in long edges of the image: 6 pixels of 320."""
 PASSES = 2
 """Rounds over all pixels."""
 MOVED_CONFIDENCE = 0.35

@@ -2,8 +2,8 @@
 
 A window that is matched as a whole holds both surfaces at an edge, and a network guesses there. A
 pixel is of one surface: at its depth it has the same grey value in the neighbours. Costs of single
-pixels are averaged over those around of the same colour, which are of the same surface (adaptive
-support weights, Yoon and Kweon 2006).
+pixels are averaged over like-coloured ones around, which are of the same surface (adaptive support
+weights, Yoon and Kweon 2006).
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from geogs.geometry.camera import Camera
 
 DEVIATIONS = 3.0
 """Median absolute deviations at which the difference of grey values is cut: beyond two standard
-deviations of the noise its size says nothing."""
+deviations of the noise its size has no meaning."""
 LEAST_DEVIATION = 0.5 / 255
 """Least such deviation: that of rounding to 8 bits."""
 RADIUS = 5
-"""Pixels around over which costs are averaged."""
+"""Radius in pixels over which costs are averaged."""
 CONTRAST = 8 / 255
 """Mean difference of colours at which their weight falls to 1 / e."""
 
@@ -47,7 +47,7 @@ def photo_costs(
         same: where both are of one surface; the neighbours' offset and noise are estimated there.
         camera: camera of the depths and of the views' ``grey``.
         mask: pixels to evaluate, by default all; elsewhere the result is 0, and the second depth is
-            taken to be the first.
+            replaced by the first.
     """
     size = (camera.width, camera.height)
     colour = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)

@@ -1,8 +1,8 @@
 """Compiled loops of the planes of bare segments: the rim of a segment, and the planes through it.
 
 Images are (h, w) and C-contiguous; a box is its first row and column, and those behind its last;
-places are x and y over the image's width and height, from its middle. Every kernel releases the
-interpreter lock. Numba compiles loops faster than expressions of arrays.
+positions are x and y as fractions of the image's width and height, from its middle. Every kernel
+releases the interpreter lock. Numba compiles loops faster than expressions of arrays.
 """
 
 from typing import NamedTuple
@@ -52,7 +52,7 @@ def segment_boxes(labels, uncertain, sky, boxes, counts):
 
 @njit(**_EXACT)
 def widened(box, reach, shape):
-    """A box with what is within ``reach`` of it in an image."""
+    """A box widened by ``reach`` on all sides, within an image."""
     return (
         max(0, box[0] - reach), max(0, box[1] - reach),
         min(shape[0], box[2] + reach), min(shape[1], box[3] + reach),
@@ -61,8 +61,8 @@ def widened(box, reach, shape):
 
 @njit(**_EXACT)
 def near_part(parts, number, box, reach):
-    """Which pixels of a box are at most ``reach`` rows and columns from a part that lies in it, as
-    an array of the size of the box."""
+    """Mask, of the size of a box, of the pixels at most ``reach`` rows and columns from a part that
+    lies in the box."""
     top, left, low, right = box
     height, width = low - top, right - left
     across, near = np.empty((height, width), np.uint8), np.empty((height, width), np.uint8)
@@ -75,7 +75,7 @@ def near_part(parts, number, box, reach):
         for u in range(width - 1, -1, -1):
             since = 0 if parts[top + v, left + u] == number else since + 1
             across[v, u] |= since <= reach
-    for u in range(width):  # numba takes seconds to compile what assigns whole rows
+    for u in range(width):  # numba takes seconds to compile assignments of whole rows
         count = 0
         for v in range(-reach, height):
             count += across[v + reach, u] if v + reach < height else 0
@@ -101,7 +101,7 @@ def rim_pixels(labels, label, box, reach, confident):
 
 @njit(**_EXACT)
 def at_pixel(plane, v, u, shape):
-    """Inverse depth of a plane at a pixel, and the place (x, y) of that."""
+    """Inverse depth of a plane at a pixel, and the pixel's position (x, y)."""
     x, y = (u + 0.5) / shape[1] - 0.5, (v + 0.5) / shape[0] - 0.5
     return plane[0] * x + plane[1] * y + plane[2], x, y
 
@@ -247,7 +247,7 @@ def explained(x, y, value, weight, tolerance, a, b, c):
 
 @njit(**_PART)
 def summed(weight):
-    """The sum, from the first on."""
+    """Sum in order, from the first on."""
     total = 0.0
     for i in range(len(weight)):
         total += weight[i]
@@ -256,7 +256,7 @@ def summed(weight):
 
 @njit(**_PART)
 def drawn(chance, uniform):
-    """The first of the increasing chances that is greater than a random number."""
+    """Index of the first of the increasing chances that is greater than a random number."""
     low, high = 0, len(chance)
     while low < high:
         middle = (low + high) // 2
@@ -301,7 +301,7 @@ def best_sample(x, y, value, weight, uniform, tolerance):
 
 @njit(**_PART)
 def mark_inliers(x, y, value, tolerance, a, b, c, on):
-    """Write which pixels are ``on`` the plane a x + b y + c; how many."""
+    """Write which pixels are ``on`` the plane a x + b y + c; return their number."""
     count = 0
     for i in range(len(value)):
         on[i] = abs(a * x[i] + b * y[i] + c - value[i]) < tolerance * value[i]
@@ -311,8 +311,8 @@ def mark_inliers(x, y, value, tolerance, a, b, c, on):
 
 @njit(**_PART)
 def fit_plane(x, y, value, weight, uniform, rules):
-    """A plane by random samples of three pixels and a least-squares fit to its inliers, the
-    inliers, and their weighted sums of xx, xy, x, yy, y and 1; no inliers where they are too few.
+    """Fit a plane by random samples of three pixels, then by least squares to its inliers; return
+    it, the inliers, and their weighted sums of xx, xy, x, yy, y and 1. Too few count as none.
     """
     (a, b, c), most = best_sample(x, y, value, weight, uniform, rules.tolerance)
     on, sums = np.empty(len(value), np.bool_), np.zeros(6)
@@ -348,8 +348,8 @@ def segment_planes(x, y, value, weight, draws, rules):
     """Planes of a segment's pixels, the one of most weight first: coefficients of x, y and 1 (p, 3)
     and their covariances, the number, from 1 on, of each pixel's plane, and how many were tried.
 
-    ``draws`` (n, t, 3) are the random numbers of at most n planes. Inliers are taken to deviate by
-    half the tolerance, and one in ``correlated`` of them to be independent.
+    ``draws`` (n, t, 3) are the random numbers of at most n planes. Inliers are assumed to deviate
+    by half the tolerance, and one in ``correlated`` of them to be independent.
     """
     planes, covariances = np.empty((len(draws), 3)), np.empty((len(draws), 3, 3))
     of, left, found, tried = np.zeros(len(x), np.int32), np.arange(len(x)), 0, 0

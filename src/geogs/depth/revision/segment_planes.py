@@ -1,9 +1,9 @@
 """Bare segments of an image as planes through the confident depths at their rims.
 
-Nothing can be matched on a bare wall or door, and what a search finds there is bowed, or of what
-the door reflects. What is around it, and its few marks, can be matched. Where most of that lies on
-one plane, the segment does, too (segment-based stereo: Tao, Sawhney and Kumar 2001; Bleyer and
-Gelautz 2005). Confident depths stay, so that curved surfaces that were matched are not flattened.
+Nothing can be matched on a bare wall or door: searched depths there are bowed, or those of
+reflections. The surroundings and a few marks can be matched. Where most of these lie on one plane,
+the segment does, too (segment-based stereo: Tao, Sawhney and Kumar 2001; Bleyer and Gelautz 2005).
+Confident depths stay, so curved surfaces that were matched are not flattened.
 """
 
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ CONFIDENCE = 0.5
 MAX_SKY = 0.2
 """Fraction of sky above which a segment has no planes."""
 MAX_DEPTH_RATIO = 5.0
-"""Largest ratio, either way, of the depth that was found to that of a plane."""
+"""Largest ratio, either way, of the searched depth to that of a plane."""
 _MIN_PIXELS, _MAX_PIXELS, _SAMPLES, _REFITS = 40, 750, 64, 4
 """Least and most pixels of a fit, samples of three that are tried, and fits of the inliers."""
 
@@ -44,13 +44,13 @@ _MIN_PIXELS, _MAX_PIXELS, _SAMPLES, _REFITS = 40, 750, 64, 4
 def planar_depth(
     labels: Int32[np.ndarray, "sh sw"], found: DenseDepth, camera: Camera, seed: int
 ) -> DenseDepth:
-    """A keyframe's depth with its uncertain pixels in bare segments of the image on their planes.
+    """Put the uncertain pixels of a keyframe's depth in bare segments of the image on planes.
 
     Args:
         labels: ``bare_segments`` of the image.
-        found: the depth.
-        camera: of the depth.
-        seed: of the samples that are tried.
+        found: the searched depth.
+        camera: camera of the depth.
+        seed: seed of the random samples.
     """
     device = found.depth.device
     sky = None if found.sky is None else found.sky.cpu().numpy()
@@ -72,7 +72,7 @@ class PlanarDepth:
     """Uncertain pixels of a depth that lie on well known planes of segments."""
 
     pixels: Int[np.ndarray, "n"]
-    """Flat indices."""
+    """Flat pixel indices."""
     depth: Float32[np.ndarray, "n"]
     """z on the planes."""
     plane: Int32[np.ndarray, "n"]
@@ -100,7 +100,7 @@ def on_planes(
     sky: Bool[np.ndarray, "h w"] | None,
     seed: int,
 ) -> PlanarDepth:
-    """Pixels on planes of the segments ``labels``; ``planar_depth`` says what the others are."""
+    """Find the pixels on planes of the segments ``labels``; other arguments as ``planar_depth``."""
     from geogs.depth.revision.segment_plane_kernels import planar_pixels
 
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
@@ -121,8 +121,8 @@ def _planes_of_segments(
 ) -> tuple[Float64[np.ndarray, "p 3"], Int32[np.ndarray, "sh sw"]]:
     """Planes, and the number, from 1 on, of the plane of each pixel of the segments; 0 for none.
 
-    An uncertain part has none where most of the confident pixels at its own rim lie on no plane: a
-    segment may go on beyond an edge that is too faint to be seen.
+    An uncertain part has none if most of the confident pixels at its own rim lie on no plane: a
+    segment may extend beyond an edge that is too faint to be seen.
     """
     from geogs.depth.revision import segment_plane_kernels as kernels
 

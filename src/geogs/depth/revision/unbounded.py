@@ -15,11 +15,11 @@ any depth."""
 _MIN_FAR = 0.005
 """Least fraction of far pixels for which a view is searched."""
 MAX_EXCESS = 0.03
-"""Largest cost at infinity less that at the depth found: their noise where both are right."""
+"""Largest cost at infinity minus that at the searched depth: their noise where both are right."""
 MAX_COST = 0.3
 """Largest cost of the sky at infinity; that of a surface is 0.4 at its depth, 0.9 at infinity."""
 _CONFIDENT = 0.5
-"""Confidence above which depths say how images differ in noise and offset."""
+"""Confidence above which depths serve to estimate the noise and offset between images."""
 
 
 class SkySearch(RevisedSearch):
@@ -34,7 +34,7 @@ class SkySearch(RevisedSearch):
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
     ) -> list[DenseDepth]:
-        """As in the protocol; what is sky stays sky."""
+        """As in the protocol; the sky stays."""
         checked = self.classical.check(depths, others)
         return [found.under(own.depth.sky) for own, found in zip(depths, checked, strict=True)]
 
@@ -44,8 +44,8 @@ def unbounded(
 ) -> Bool[Tensor, "h w"] | None:
     """Far pixels whose cost at infinity (rotations alone count) is no worse than at their depth.
 
-    Costs are means over single pixels of like colour (``photo_costs``), so that a roof says nothing
-    of the sky beside it. None if there are none, few pixels are far, or there are no other views.
+    Costs are means over single pixels of like colour (``photo_costs``), so a roof does not affect
+    the sky beside it. None if there are none, few pixels are far, or there are no other views.
     """
     confident = found.confidence > _CONFIDENT
     if not others or not bool(confident.any()):

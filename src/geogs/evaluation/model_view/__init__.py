@@ -1,1 +1,1 @@
-"""A model that turns in a page: what it shows, how it is packed, and the HTML around it."""
+"""Interactive model in a page: its content, its packing, and the HTML around it."""

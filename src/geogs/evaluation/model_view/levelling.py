@@ -1,4 +1,4 @@
-"""Which way is up in a reconstruction: by its planes, and by how the camera was held."""
+"""Up direction of a reconstruction, by its planes and by the camera's orientation."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,27 +9,27 @@ from jaxtyping import Float, Int
 from geogs.evaluation.held_camera import level_axes
 
 FARTHEST = 55.0
-"""Degrees between up and the camera's own mean up, at most."""
+"""Largest angle between up and the camera's mean up, degrees."""
 AGREES = 5.0
-"""Degrees up to which a surface is called level or upright."""
+"""Largest tilt of a surface that counts as level or upright, degrees."""
 LEAST_SHARE = 0.18
-"""Part of all area that has to agree; of a ball 9 % do."""
+"""Least fraction of the area that must agree; for a ball it is 9 %."""
 LEAST_WALLS = 0.25
-"""Length of the mean of walls' quadrupled azimuths from which rooms count as rectangular."""
+"""Least length of the mean of walls' quadrupled azimuths for a rectangular room."""
 _STEP, _WIDTH = 2.5, 4.0
-"""Degrees between directions that are tried, and the deviation of a vote."""
+"""Degrees between the tested directions, and the standard deviation of a vote."""
 _PARTS = 32
-"""Steps of a normal's coordinates by which facets vote together."""
+"""Quantisation of normals, in steps per unit; facets of equal normals vote together."""
 _UPRIGHT = 0.5
-"""Weight of upright area, beside level area."""
+"""Weight of upright area relative to level area."""
 _HELD, _HELD_WIDTH = 0.1, 20.0
-"""Votes of the camera, as a part of all area, and their deviation in degrees."""
+"""Weight of the camera's vote relative to the whole area, and its standard deviation in degrees."""
 _FIRM = 1e-3
-"""The same where the best direction is refined: it decides only what planes leave open."""
+"""The same weight in the refinement: it decides only directions that planes do not determine."""
 
 
 class Facets(NamedTuple):
-    """Triangles as what counts of them from afar."""
+    """Triangles, as centres, normals and areas."""
 
     centres: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
@@ -39,16 +39,16 @@ class Facets(NamedTuple):
 
 @dataclass(frozen=True)
 class Level:
-    """How a reconstruction stands upright."""
+    """Upright orientation of a reconstruction."""
 
     axes: Float[np.ndarray, "3 3"]
     """Rows right, forward, up in the world; right runs along the walls of a rectangular room."""
     share: float | None
-    """Part of the surface that is level or upright then; none where the camera alone decided."""
+    """Fraction of the surface that is level or upright; none where the camera alone decided."""
 
     @property
     def sentence(self) -> str:
-        """For the page."""
+        """Message for the page."""
         if self.share is None:
             return "Upright as the camera was held."
         return f"Upright by its planes: {self.share:.0%} of the surface are level or vertical."
@@ -68,10 +68,10 @@ def facets(
 
 
 def level(surface: Facets | None, T_wc: Float[np.ndarray, "k 4 4"]) -> Level:
-    """Stand a surface upright: floors, ceilings and table tops level, walls vertical.
+    """Find upright axes of a surface: floors, ceilings and table tops level, walls vertical.
 
     Each facet votes with its area for the directions along its normal and, half as much, for those
-    at right angles to it; the best within 55 degrees of the camera's mean up is refined by least
+    perpendicular to it; the best within 55 degrees of the camera's mean up is refined by least
     squares. Where less than 18 % of the area agree, as on a plant, the camera decides alone.
     """
     held = level_axes(T_wc)
@@ -86,7 +86,7 @@ def level(surface: Facets | None, T_wc: Float[np.ndarray, "k 4 4"]) -> Level:
 
 
 def _together(surface: Facets) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:
-    """Mean normals of facets that lie alike, and their parts of the whole area."""
+    """Mean normals of facets with equal quantised normals, and their fractions of the area."""
     cells = np.rint(_PARTS * surface.normals).astype(np.int64) @ np.array([10_000, 100, 1])
     _, group = np.unique(cells, return_inverse=True)
     sums = [
@@ -99,7 +99,7 @@ def _together(surface: Facets) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarr
 def _best(
     normals: Float[np.ndarray, "b 3"], weights: Float[np.ndarray, "b"], held: np.ndarray
 ) -> Float[np.ndarray, "3"]:
-    """The direction with most votes, of those on rings around the camera's own."""
+    """The direction with most votes, of those on rings around the camera's up."""
     side = _unit(np.cross(held, np.eye(3)[np.abs(held).argmin()]))
     rings = [held[None]]
     for tilt in np.radians(np.arange(_STEP, FARTHEST, _STEP)):
@@ -118,7 +118,7 @@ def _refined(
     up: np.ndarray,
     held: np.ndarray,
 ) -> Float[np.ndarray, "3"]:
-    """Least squares over what agrees: (n·up)² of walls, and what is missing to 1 of floors."""
+    """Least squares over agreeing facets: (n·up)² of walls, 1 - (n·up)² of floors."""
     for _ in range(10):
         cosine = normals @ up
         shares = weights * _votes(cosine) * np.where(np.abs(cosine) > 0.7, -1.0, 1.0)
@@ -131,7 +131,7 @@ def _refined(
 def _along_walls(
     normals: Float[np.ndarray, "b 3"], weights: Float[np.ndarray, "b"], axes: np.ndarray
 ) -> Float[np.ndarray, "3 3"]:
-    """Axes turned about up until walls face along them, by less than 45 degrees."""
+    """Rotate axes about up to align with the walls, by less than 45 degrees."""
     east, north, high = (normals @ axis for axis in axes)
     walls = weights * (np.abs(high) < np.sin(np.radians(2 * AGREES)))
     mean = (walls * np.exp(4j * np.arctan2(north, east))).sum() / max(walls.sum(), 1e-12)
@@ -143,7 +143,7 @@ def _along_walls(
 
 
 def _votes(cosine: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
-    """What normals say of a direction, by their cosines to it."""
+    """Votes of normals for a direction, by their cosines to it."""
     is_level = np.abs(cosine) > 0.7
     return np.where(is_level, 1.0, _UPRIGHT) * _vote(np.arcsin(_off(cosine).clip(0, 1)), _WIDTH)
 

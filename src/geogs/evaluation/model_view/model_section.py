@@ -1,4 +1,4 @@
-"""The part of a page in which a model turns: markup, data, library and script, all inside."""
+"""Page section with the interactive model: markup, data, library and script, all inline."""
 
 import base64
 import html
@@ -24,8 +24,8 @@ SCRIPTS = (
 
 
 def model_section(model: ShownModel) -> tuple[str, tuple[str, str]]:
-    """HTML of the model, and the scripts in it; it needs nothing from elsewhere, and one page holds
-    one of them."""
+    """HTML of the model, and the scripts in it; it needs no other files, and a page may hold only
+    one."""
     own = "\n".join(_file(name) for name in SCRIPTS)
     scripts = _file("three.min.js"), f"(() => {{\n'use strict';\n{own}\n}})();"
     scene, arrays, images = pack(model)

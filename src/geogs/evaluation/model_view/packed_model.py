@@ -1,7 +1,7 @@
-"""A model as few bytes that a page carries: arrays quantised, differenced, deflated.
+"""A model packed for a page: arrays quantised, differenced, deflated.
 
-The page's own script, ``browser/unpack.js``, undoes this. Lengths lose less than a 65 535th of the
-extent of what they belong to, colours and triangles nothing.
+The page's own script, ``browser/unpack.js``, undoes this. Lengths lose less than 1 / 65 535 of the
+extent of their array; colours and triangles are lossless.
 """
 
 import json
@@ -28,9 +28,9 @@ _STATES = ("tracked", "orientation only", "lost")
 
 
 def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
-    """What a page needs: its directory (for JSON), the deflated arrays, and the JPEG images.
+    """Pack a model for a page: its directory (for JSON), the deflated arrays, and the JPEG images.
 
-    All is turned to the axes of WebGL: x right, y up, z backward.
+    All is in the axes of WebGL: x right, y up, z backward.
     """
     R = webgl_axes(model.axes)
     arrays, images = _Arrays(), bytearray()
@@ -71,7 +71,7 @@ def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
 
 
 def _room(room: Room) -> dict[str, Any]:
-    """Bounds as WebGL has its axes, whose z is backward; far away where there is none."""
+    """Bounds in the axes of WebGL, whose z is backward; far away where there is none."""
     low, high = (np.clip(bound, -_FAR, _FAR).tolist() for bound in (room.low, room.high))
     return {
         "low": [low[0], low[2], -high[1]],
@@ -144,9 +144,9 @@ def quantised(
 
 
 def _face_differences(faces: Int[np.ndarray, "m 3"]) -> UInt[np.ndarray, "m 3"]:
-    """Triangles by their first vertex: that one, and how much higher the two others are.
+    """Sort triangles by their first vertex; the other two become differences to it.
 
-    The first is the least of the three, so that no difference is negative; the turn stays.
+    The first is the least of the three, so that no difference is negative; the winding stays.
     """
     if not len(faces):
         return np.zeros((0, 3), np.uint32)
@@ -158,20 +158,20 @@ def _face_differences(faces: Int[np.ndarray, "m 3"]) -> UInt[np.ndarray, "m 3"]:
 
 
 class _Arrays:
-    """Arrays one after the other: each the differences of its rows, column by column, and of
-    each column first all lowest bytes, then the next: so they deflate best."""
+    """Concatenated arrays: row differences, column by column, and for each column all lowest bytes
+    first, then the next, for best compression."""
 
     def __init__(self) -> None:
         self.content = bytearray()
 
     def add(self, values: UInt[np.ndarray, "n c"]) -> list[int]:
-        """Append an array of unsigned integers; its offset, rows, columns and bytes a number."""
+        """Append an array of unsigned integers. Returns offset, rows, columns, bytes per number."""
         size = values.dtype.itemsize
         place = [len(self.content), *values.shape, size]
         kind = values.dtype.newbyteorder("<")
         for column in values.T:
             difference = np.diff(column, prepend=column.dtype.type(0)).astype(kind)
-            # Zigzag: small steps down become small numbers, too.
+            # Zigzag: small negative steps become small numbers, too.
             signed = difference.view(kind.str.replace("u", "i")).astype(np.int64)
             zigzag = ((signed << 1) ^ (signed >> 63)).astype(kind)
             self.content += zigzag.view(np.uint8).reshape(-1, size).T.tobytes()
@@ -183,5 +183,5 @@ def _norm(rows: np.ndarray) -> np.ndarray:
 
 
 def to_json(scene: dict[str, Any]) -> str:
-    """The directory as a script element may hold it."""
+    """The directory as JSON that is safe in a script element."""
     return json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""Walls and ceiling of a room, which are in the way of those who look into it from outside."""
+"""Walls and ceiling of a room, which occlude a view into it from outside."""
 
 from dataclasses import dataclass
 
@@ -8,21 +8,21 @@ from jaxtyping import Float
 from geogs.evaluation.model_view.levelling import Facets
 
 LEAST_AREA, MOST_BEYOND = 0.03, 0.03
-"""Area of a wall, and of what is beyond it, as parts of all."""
+"""Least area of a wall, and largest area beyond it, as fractions of the whole area."""
 FACES = 20.0
-"""Degrees up to which a facet faces inwards."""
+"""Largest angle to the inward direction for a facet to face inwards, degrees."""
 DEEP = (0.08, 0.08, 0.04)
-"""What stands at a wall and goes with it, as a part of the room's extent; likewise the ceiling."""
+"""Depth of objects at a wall, or ceiling, that are hidden with it, relative to the extent."""
 _GROUND = 0.06
-"""Part of the height up to which all stays: the floor."""
+"""Fraction of the height that is always shown: the floor."""
 _KEPT = 0.005
 
 
 @dataclass(frozen=True)
 class Room:
-    """Inside which nothing is in the way; coordinates along right, forward and up.
+    """Box inside which nothing occludes; coordinates along right, forward and up.
 
-    Who is beyond one of these bounds looks through what is beyond it, too, but for the floor.
+    A viewer beyond one of these bounds sees through everything beyond it, except the floor.
     """
 
     low: Float[np.ndarray, "3"]
@@ -30,15 +30,15 @@ class Room:
     high: Float[np.ndarray, "3"]
     """Infinity where there is no wall, or no ceiling."""
     ground: float
-    """Height up to which all stays."""
+    """Height up to which everything is shown."""
 
 
 def find_room(
     surface: Facets, axes: Float[np.ndarray, "3 3"], T_wc: Float[np.ndarray, "k 4 4"]
 ) -> Room:
-    """The sides of a surface, in level axes, on which there is a wall or a ceiling.
+    """Find the sides of a surface, in level axes, with a wall or a ceiling.
 
-    That is area which faces inwards, lies beyond most of the cameras, and has little beyond it.
+    A wall is area that faces inwards, lies beyond most of the cameras, and has little beyond it.
     """
     local, normals = surface.centres @ axes.T, surface.normals @ axes.T
     cameras = np.median(T_wc[:, :3, 3] @ axes.T, axis=0)
@@ -60,7 +60,7 @@ def _wall(
     camera: float,
     extent: float,
 ) -> float | None:
-    """Where, along a direction, the wall is that faces against it."""
+    """Coordinate, along a direction, of the wall that faces against it; none without one."""
     is_wall = (facing < -np.cos(np.radians(FACES))) & (along > camera)
     if not areas[is_wall].sum() > LEAST_AREA * areas.sum():
         return None

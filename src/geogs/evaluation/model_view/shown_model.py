@@ -1,4 +1,4 @@
-"""What the model of a page shows: a surface, paths, keyframes and disks."""
+"""Content of a page's model: a surface, paths, keyframes and disks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,11 +16,11 @@ class Colouring:
     """One way to colour the vertices of a surface."""
 
     name: str
-    """On a button."""
+    """Label of its button."""
     colours: UInt8[np.ndarray, "n 3"]
     """RGB."""
     legend: "Legend | None" = None
-    """What the colours mean, where they are not those of the images."""
+    """Legend of the colours; none for those of the images."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class Legend:
 
     title: str
     ends: tuple[str, str]
-    """What the first and the last colour stand for."""
+    """Values of the first and the last colour."""
     stops: Sequence[str]
-    """Colours from one end to the other, as CSS has them."""
+    """CSS colours from one end to the other."""
     note: str = ""
-    """What another colour means."""
+    """Meaning of an additional colour."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PathModel:
     points: Float[np.ndarray, "n 3"]
     """Map units."""
     states: Sequence[FrameState] | None = None
-    """What is known of each point; none of a true path."""
+    """State of each point; none for a true path."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class KeyframeModel:
     T_wc: Float[np.ndarray, "4 4"]
     """Camera to world."""
     jpeg: bytes | None = None
-    """Its image; none where that is not shown."""
+    """Its image; none if it is not shown."""
 
 
 @dataclass(frozen=True)
@@ -92,29 +92,29 @@ class ImageExtent:
 
 @dataclass(frozen=True)
 class Lengths:
-    """What a unit of the map is."""
+    """Unit of length of the map."""
 
     metres: float | None = None
-    """None where that is not known."""
+    """Metres per map unit; none where unknown."""
     note: str = ""
-    """A sentence on it, for those who measure."""
+    """A sentence on the unit, for measurements in the page."""
 
 
 @dataclass(frozen=True)
 class ShownModel:
-    """All that is shown, in the frame of the map, with the axes by which it stands upright."""
+    """The shown model, in the frame of the map, with its upright axes."""
 
     axes: Float[np.ndarray, "3 3"]
     """Rows right, forward and up of the world."""
     start: StartView
-    """From where it is seen first, and what it turns about."""
+    """Start view; its target is the centre of rotation."""
     lens: ImageExtent
     surface: SurfaceModel | None = None
     paths: Sequence[PathModel] = ()
     keyframes: Sequence[KeyframeModel] = ()
     disks: DiskModel | None = None
     room: Room | None = None
-    """What is in the way of those who look in from outside."""
+    """Walls and ceiling that occlude a view from outside."""
     lengths: Lengths = field(default_factory=Lengths)
     notes: Sequence[str] = field(default_factory=tuple)
-    """Sentences under it, such as what was left out."""
+    """Sentences under the model, such as on omitted parts."""

@@ -1,4 +1,4 @@
-"""From where a model is seen first: all of it is in the picture, and most of it faces one."""
+"""Start view of a model: all of it is in the picture, and most of it faces the viewer."""
 
 from typing import NamedTuple
 
@@ -9,16 +9,16 @@ from geogs.evaluation.held_camera import look_at_one_place
 from geogs.evaluation.model_view.levelling import Facets
 
 FIELD = 45.0
-"""Degrees from the lower edge of the picture to the upper."""
+"""Vertical field of view, degrees."""
 ASPECT = 1.5
-"""Width of a picture by its height into which all fits; a narrower one is seen from farther."""
+"""Aspect ratio (width / height) that the model fits into; narrower ones need more distance."""
 ELEVATION = 40.0
-"""Degrees by which one looks down on a place."""
+"""Elevation angle of the view, degrees."""
 _TURNS = 24
-"""Directions around that are tried."""
+"""Number of tested azimuths."""
 _MARGIN = 1.05
 _KEPT = 0.005
-"""Part of the points on each side that may be cut off."""
+"""Fraction of the points on each side that may be cut off."""
 
 
 class StartView(NamedTuple):
@@ -34,14 +34,14 @@ def start_view(
     T_wc: Float[np.ndarray, "k 4 4"],
     surface: Facets | None = None,
 ) -> StartView:
-    """A place obliquely from above, from where most of its surface faces the eye, so that walls
-    nearest to it turn their backs; an object from the side of the cameras.
+    """Choose an oblique view from above from which most of the surface faces the eye, so that the
+    nearest walls are seen from behind; an object is seen from the side of the cameras.
 
     Args:
-        points: of its shape; all of them are in the picture, but those that float far away.
+        points: points of its shape; all but far outliers are in the picture.
         axes: rows right, forward and up of the world.
         T_wc: the cameras, which are in the picture, too.
-        surface: by what the side is chosen; without it, what the cameras looked at is ahead.
+        surface: surface for the choice of the side; without it, the view is along the cameras'.
     """
     local = points.astype(np.float64) @ axes.T
     low, high = np.quantile(local, [_KEPT, 1 - _KEPT], axis=0)
@@ -61,7 +61,7 @@ def start_view(
 def _open_side(
     axes: Float[np.ndarray, "3 3"], T_wc: Float[np.ndarray, "k 4 4"], surface: Facets | None
 ) -> Float[np.ndarray, "3"]:
-    """The direction, in level axes, from which most area faces one, as it is foreshortened."""
+    """The direction, in level axes, from which most (foreshortened) area faces the viewer."""
     rise = np.radians(ELEVATION)
     turns = 2 * np.pi * (np.arange(_TURNS) + 0.5) / _TURNS
     level = np.stack([np.cos(turns), np.sin(turns)], 1) * np.cos(rise)
@@ -77,11 +77,11 @@ def _open_side(
 def _fitted(
     local: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The nearest eye in this direction that sees all points, and the target in their midst.
+    """The nearest eye in this direction that sees all points, and the target at their centre.
 
     With z towards the eye and t = tan(field / 2), planes through the picture's edges touch points
     where x_eye + t z_eye = a = max(x + t z) and -x_eye + t z_eye = b = max(-x + t z), so that
-    x_eye = (a - b) / 2 and z_eye = (a + b) / 2 t; y likewise, and the greater z counts.
+    x_eye = (a - b) / 2 and z_eye = (a + b) / 2 t; the same for y, and the greater z is used.
     """
     right = np.cross([0.0, 0.0, 1.0], direction)
     right /= max(np.linalg.norm(right), 1e-12)

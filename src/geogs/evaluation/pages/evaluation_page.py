@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SAME_POSES_CM = 1e-4
-"""Errors up to which poses are those that were given, and not worth a table or a picture."""
+"""Largest error in cm of poses that equal the true ones, which need no table or picture."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All errors of a result; a part is none where its truth or its file was not there."""
+    """All errors of a result; a part is none where its truth or its file is missing."""
 
     trajectory: TrajectoryErrors
     """Errors of every frame."""
@@ -40,16 +40,16 @@ class Evaluation:
     """Errors of the keyframes alone, with an alignment of their own."""
     reconstruction: SurfaceScores | None
     settings: dict[str, Any]
-    """What was compared and how."""
+    """Settings of the comparison."""
     photo: PhotoScores | None = None
-    """How well the images agree on the surface."""
+    """Photo-consistency of the images on the surface."""
     reliability: Reliability | None = None
-    """The errors of all frames beside what the run said of them; none where it said nothing."""
+    """Errors of all frames with the run's standard deviations; none where it gave none."""
     doubts: tuple[str, ...] = ()
-    """What speaks against the comparison, in sentences."""
+    """Warnings on the comparison, in sentences."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Values for JSON."""
         return {
             "doubts": self.doubts,
             "trajectory": self.trajectory.as_dict(),
@@ -62,7 +62,7 @@ class Evaluation:
 
 
 def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Everything that is shown: headings with names (and units) and values."""
+    """All shown values: headings with names (and units) and values."""
     result = []
     if evaluation.reconstruction is not None:
         scores = evaluation.reconstruction
@@ -87,7 +87,7 @@ def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def table(evaluation: Evaluation) -> "Table":
-    """The rows for a terminal."""
+    """Table for a terminal."""
     from rich.table import Table
 
     result = Table("measure", "value", title="errors")
@@ -112,17 +112,17 @@ def write_report(
 ) -> None:
     """Write ``eval.json`` and a page with the errors, the pictures and the run's own tables.
 
-    The page holds all that it shows.
+    The page needs no other files.
 
     Args:
         evaluation: the errors.
-        json_file: for programs.
-        page: for people.
-        pictures: titles and files; those that are missing are left out.
-        run: what the run said of itself.
-        title: what was reconstructed.
-        judged: the verdict of the run; the errors stand beneath it.
-        model: what turns at the head.
+        json_file: file for programs.
+        page: HTML file.
+        pictures: titles and files; missing ones are left out.
+        run: sections of the run.
+        title: title of the page.
+        judged: the verdict of the run; the errors follow it.
+        model: interactive model at the top.
     """
     write_text(json_file, json.dumps(evaluation.as_dict(), indent=2, default=str) + "\n")
     judged = judged or FiguresSection("", None, ())
@@ -139,7 +139,7 @@ def write_report(
 
 
 def error_figures(evaluation: Evaluation) -> list[tuple[str, str]]:
-    """The errors that matter most."""
+    """The main errors."""
     result = []
     path = evaluation.trajectory
     if path.ate_max_cm > SAME_POSES_CM:
@@ -153,7 +153,7 @@ def error_figures(evaluation: Evaluation) -> list[tuple[str, str]]:
 
 
 def _with_unit(name: str, value: str) -> tuple[str, str]:
-    """A number as people say it, from one that stands under "name (unit, of what)"."""
+    """Name and rounded value with unit, from a row named "name (unit, of what)"."""
     name, _, rest = name.partition(" (")
     unit, _, of_what = rest.removesuffix(")").partition(" ")
     try:

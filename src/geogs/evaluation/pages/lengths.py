@@ -1,4 +1,4 @@
-"""What lengths on a page are, by what a run said of its scale."""
+"""Unit of lengths on a page, by the scale of a run."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 from geogs.evaluation.model_view.shown_model import Lengths
 
 METRES = {"metres": 1.0, "millimetres": 0.001}
-"""Units of poses that say theirs."""
+"""Metres per unit of poses, by the name of the unit."""
 
 
 def lengths(summary: Mapping[str, Any]) -> Lengths:
-    """Metres where ``scale`` in ``summary.json`` says so, else units of the sequence."""
+    """Metres where ``scale`` in ``summary.json`` is metric, else units of the sequence."""
     scale = summary.get("scale")
     said = scale if isinstance(scale, str) else ""
     kind, _, rest = said.partition(" (")
@@ -26,7 +26,7 @@ def lengths(summary: Mapping[str, Any]) -> Lengths:
 
 
 def _uncertain(metric: object) -> str:
-    """How far the scale may be off, at two standard deviations."""
+    """Relative uncertainty of the scale, two standard deviations."""
     deviation = metric.get("deviation") if isinstance(metric, Mapping) else None
     if not isinstance(deviation, int | float) or not 0 < deviation < 1:
         return ""

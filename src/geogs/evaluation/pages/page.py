@@ -15,13 +15,13 @@ from geogs.io.writers.atomic import write_text
 
 @dataclass(frozen=True)
 class TableSection:
-    """A table under a heading; the first column names a row, the others are set to the right."""
+    """A table under a heading; the first column names a row, the others are right-aligned."""
 
     heading: str
     columns: Sequence[str]
-    """Their titles; none shows no head."""
+    """Column titles; without any there is no head."""
     rows: Sequence[Sequence[str]]
-    """Cells as text; a name that begins with spaces is set in."""
+    """Cells as text; a name that begins with spaces is indented."""
     note: str = ""
     """A sentence under the table."""
 
@@ -36,7 +36,7 @@ class PictureSection:
 
 @dataclass(frozen=True)
 class TextSection:
-    """Text under a heading, with its spaces and line ends kept."""
+    """Preformatted text under a heading."""
 
     heading: str
     text: str
@@ -44,23 +44,23 @@ class TextSection:
 
 @dataclass(frozen=True)
 class FiguresSection:
-    """A sentence of judgement, and the few numbers that matter most, side by side."""
+    """A verdict, and the main numbers side by side."""
 
     sentence: str
-    """Nothing where nothing was judged."""
+    """Empty without a verdict."""
     is_good: bool | None
-    """How it is marked; none is neutral."""
+    """Mark of the verdict; none is neutral."""
     figures: Sequence[tuple[str, str]]
-    """What each is, with its unit, and its value."""
+    """Name with unit, and value, of each number."""
 
 
 @dataclass(frozen=True)
 class HtmlSection:
-    """A part that is HTML already, such as a model that turns."""
+    """A part in HTML, such as the interactive model."""
 
     html: str
     scripts: Sequence[str] = ()
-    """Scripts in it that may run, as they stand between their tags."""
+    """Scripts in it that may run, without their tags."""
 
 
 Section = TableSection | PictureSection | TextSection | FiguresSection | HtmlSection
@@ -73,18 +73,18 @@ def write_page(
     subtitle: str = "",
     is_whole: bool = False,
 ) -> None:
-    """Write a page that any browser shows from the disk: on a phone, and in the dark, too.
+    """Write a page for any browser, from the disk: also on a phone, and in dark mode.
 
-    All text is escaped. Pictures are linked by their place relative to the page and are not
-    copied, so they should lie beside it; a page that ``is_whole`` holds copies of them, as WebP,
-    and needs no other file.
+    All text is escaped. Pictures are linked by their path relative to the page and are not copied,
+    so they should lie beside it; with ``is_whole`` the page embeds copies of them, as WebP, and
+    needs no other file.
 
     Args:
         path: the page, usually ``index.html`` of a folder.
-        title: of the page.
+        title: title of the page.
         sections: tables, pictures and texts in the order in which they appear.
         subtitle: a line under the title.
-        is_whole: whether pictures are inside.
+        is_whole: whether pictures are embedded.
 
     Raises:
         OutputError: it cannot be written.
@@ -103,7 +103,7 @@ def write_page(
 
 
 def _policy(scripts: Sequence[str]) -> str:
-    """Content security policy: nothing is loaded, and no script runs but these."""
+    """Content security policy: nothing is loaded, and only these scripts run."""
     digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
     allowed = [f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests]
     policy = (
@@ -175,7 +175,7 @@ def _picture(section: PictureSection, folder: Path | None) -> str:
 
 
 def _inside(file: Path) -> str:
-    """A picture as an address that holds it; nothing where it is none, or a bomb."""
+    """A picture as a data URL; empty if it is no picture, or far too large."""
     import cv2
     from PIL import Image
 

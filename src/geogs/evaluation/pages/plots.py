@@ -1,4 +1,4 @@
-"""Pictures of a result beside the truth, drawn by matplotlib without a display, written as PNG."""
+"""Plots of a result and the truth, by matplotlib without a display, written as PNG."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 _TRUTH, _ESTIMATE = "0.45", "#0072b2"
 _ERROR_MAP = "YlOrRd"
 ERROR_STOPS = ("#ffffcc", "#fed976", "#fd8d3c", "#e2191c", "#800026")
-"""Colours of :func:`error_colours` from none to the worst, as CSS has them."""
+"""CSS colours of :func:`error_colours` from zero to the largest error."""
 _UNKNOWN = 190
 
 
 def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
-    """Aligned estimate over the truth, from above and from the side, coloured by its error."""
+    """Plot the aligned estimate over the truth, from above and the side, coloured by its error."""
     figure = new_figure(11.0, 4.6)
     axes = level_axes(errors.truth)
     origin = errors.truth[:, :3, 3].mean(0)
@@ -47,14 +47,14 @@ def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
         plot.legend(loc="best")
         plots.append(plot)
     figure.colorbar(dots, ax=plots, label="position error (cm)", shrink=0.8)
-    figure.draw_without_rendering()  # settles the limits, whose tick labels then need room
+    figure.draw_without_rendering()  # fixes the limits, whose tick labels need space
     save_figure(figure, path)
 
 
 def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
-    """Position error in cm and rotation error in degrees against time.
+    """Plot position error in cm and rotation error in degrees against time.
 
-    Rotations are those that count: absolute, or over the stretch that begins with each pose.
+    Rotation errors are absolute or relative over the stretch from each pose, see ``rotations``.
     """
     figure = new_figure(10.0, 4.2)
     order = np.argsort(errors.timestamps)
@@ -78,7 +78,7 @@ def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
 
 
 def plot_reliability(path: Path, reliability: Reliability) -> None:
-    """Reliability diagram: observed over predicted fractions of the frames."""
+    """Plot the reliability diagram: observed over predicted fractions of the frames."""
     figure = new_figure(5.2, 4.6)
     plot = figure.add_subplot(1, 1, 1)
     predicted = np.linspace(0, 1, 201)
@@ -94,7 +94,7 @@ def plot_reliability(path: Path, reliability: Reliability) -> None:
 
 
 def plot_beside_truth(path: Path, compared: SurfaceComparison, views: Sequence[Viewpoint]) -> None:
-    """A shaded mesh, the truth if that is one, and the mesh in the colours of its error.
+    """Draw a shaded mesh, the truth if that is a mesh, and the mesh in the colours of its error.
 
     Each is a row, with a column for each view.
     """
@@ -132,8 +132,8 @@ def error_colours(
 ) -> UInt8[np.ndarray, "n 3"]:
     """Colour of each vertex by the mean error of the three compared points nearest to it.
 
-    Pale is 0, dark red the limit of the scores and more; grey are vertices without a point within
-    reach, which were not compared.
+    Pale is 0, dark red the limit of the scores and more; vertices without a point within reach,
+    which were not compared, are grey.
     """
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
@@ -150,7 +150,7 @@ def error_colours(
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """A figure of its own (inches), outside of pyplot and its global state."""
+    """Make a figure (size in inches) outside of pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""The page of a run: what happened in numbers, and the pictures that need no truth."""
+"""The page of a run: statistics, and the pictures that need no truth."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -33,12 +33,12 @@ def write_run_page(
     model: ShownModel | None = None,
     pictures: Path | None = None,
 ) -> None:
-    """Write ``index.html``, which holds all that it shows.
+    """Write ``index.html``, which needs no other files.
 
     Args:
         folder: ``report/`` of a result.
-        summary: what ``summary.json`` holds; numbers that are not there are left out.
-        model: what turns at its head.
+        summary: content of ``summary.json``; missing numbers are left out.
+        model: interactive model at the top.
         pictures: folder of the run's pictures; the same if none is given.
 
     Raises:
@@ -63,7 +63,7 @@ def figures(summary: Mapping[str, Any], numbers: list[tuple[str, str]]) -> Figur
 
 
 def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The numbers of a run that matter most."""
+    """The main numbers of a run."""
     seconds, rates = summary.get("seconds"), summary.get("frames_per_second")
     total = seconds.get("total") if isinstance(seconds, Mapping) else None
     rate = rates.get("with_final_stages") if isinstance(rates, Mapping) else None
@@ -79,7 +79,7 @@ def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def run_sections(summary: Mapping[str, Any]) -> list[Section]:
-    """Tables of what ``summary.json`` holds: the run, and the seconds of its stages."""
+    """Tables of ``summary.json``: the run, and the seconds of its stages."""
     rows_of_run = [
         (title, text) for title, key, show in _RUN_ROWS if (text := _shown(show, summary.get(key)))
     ]
@@ -92,7 +92,7 @@ def run_sections(summary: Mapping[str, Any]) -> list[Section]:
 
 
 def _shown(show: Show, value: object) -> str:
-    """A fact of the summary in words; nothing where it is none, or not what a run writes."""
+    """Format an entry of the summary; empty if it is none, or malformed."""
     try:
         return "" if value is None else show(value)
     except UNUSABLE:
@@ -108,7 +108,7 @@ def _count(value: object) -> str:
 
 
 def _present(value: object) -> str:
-    """A number that is worth a line only if it is not 0."""
+    """Format a count; empty if it is 0."""
     return _count(value) if value else ""
 
 

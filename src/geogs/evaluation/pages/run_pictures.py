@@ -14,19 +14,19 @@ from geogs.types import RenderedKeyframe, Trajectory
 
 Layer = Literal["image", "depth", "normal", "confidence"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-"""What is known of a keyframe, pixel by pixel."""
+"""Image layers of a keyframe."""
 
 _INK, _GRID, _PATH, _LOST = (60, 60, 60), (225, 225, 225), (0, 114, 178), (213, 94, 0)
 _CELL, _GAP, _HEAD, _BAR = 420, 6, 28, 90
-"""Pixels of the keyframes' picture: width of a cell, between cells, above and beside them."""
+"""Layout of the keyframes' picture in pixels: cell width, gap, head and depth bar."""
 _PANEL, _LEFT, _TOP, _BOTTOM = (540, 440), 58, 48, 44
-"""Pixels of a view of the path, width and height, and its margins."""
+"""Layout of a view of the path in pixels: size and margins."""
 _TICKS, _FINE = 6, 4
-"""About how many ticks an axis has; binary digits of a pixel's fraction that OpenCV is given."""
+"""Approximate number of ticks on an axis; fractional bits of OpenCV's pixel coordinates."""
 
 
 def draw_path(path: Path, trajectory: Trajectory) -> None:
-    """The camera path from above and from the side, in map units; lost stretches are marked."""
+    """Draw the camera path from above and the side, in map units; lost stretches are marked."""
     axes = level_axes(trajectory.T_wc)
     points = (trajectory.T_wc[:, :3, 3] - trajectory.T_wc[0, :3, 3]) @ axes.T
     names = (("from above", "forward", 1), ("from the side", "up", 2))
@@ -40,7 +40,7 @@ def draw_path(path: Path, trajectory: Trajectory) -> None:
 def path_panel(
     points: Float[np.ndarray, "n 2"], lost: Bool[np.ndarray, "n"], name: str, upwards: str
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A path on a grid of equal scale, with its start and where it was lost."""
+    """Draw a path on a grid of equal scale, with its start and lost parts."""
     width, height = _PANEL
     panel = np.full((height, width, 3), 255, np.uint8)
     inner = np.array([width - _LEFT - 12, height - _TOP - _BOTTOM], float)
@@ -74,7 +74,7 @@ def path_panel(
 
 
 def tick_step(span: float) -> float:
-    """A round number of which about six make a span: one, two or five times a power of ten."""
+    """Round step for about six ticks in a span: one, two or five times a power of ten."""
     rough = span / _TICKS
     power = 10.0 ** np.floor(np.log10(rough))
     return float(power * min((1, 2, 5, 10), key=lambda m: abs(np.log(m * power / rough))))
@@ -86,10 +86,10 @@ def draw_keyframes(
     depths: Sequence[Float[np.ndarray, "h w"]],
     normals: Sequence[Float[np.ndarray, "h w 3"]],
 ) -> None:
-    """One row a keyframe: image, rendered depth (one colour scale for all) and normals.
+    """Draw one row per keyframe: image, rendered depth (one colour scale for all) and normals.
 
     Depth is white where it is 0 or not finite; normals (camera frame) show x, y, z as red, green,
-    blue, from -1 dark to 1 bright, towards the camera being bright blue.
+    blue, from -1 dark to 1 bright; surfaces that face the camera are bright blue.
     """
     known = [d[np.isfinite(d) & (d > 0)] for d in depths]
     values = np.concatenate(known) if known else np.zeros(0)
@@ -137,7 +137,7 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
     """A picture of one layer, RGB; black where nothing is known.
 
     Depth goes from blue, near, to red, far (1st to 99th percentile); normals show x, y, z of the
-    camera as red, green, blue, what faces the camera being bright blue; confidence goes to white.
+    camera as red, green, blue; surfaces that face the camera are bright blue; confidence is white.
     """
     match layer:
         case "image":
@@ -158,7 +158,7 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
 
 
 def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> None:
-    """What the colours of depth mean, drawn into a strip of the picture."""
+    """Draw the colour bar of depth into a strip of the picture."""
     top, length = _HEAD + 20, min(place.shape[0] - _HEAD - 40, 300)
     if length < 20:
         return
@@ -173,7 +173,7 @@ def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> No
 def _tick(
     panel: UInt8[np.ndarray, "h w 3"], axis: int, at: float, text: str, inner: np.ndarray
 ) -> None:
-    """A line of the grid with its number; ``at`` is where it crosses the axis, in pixels."""
+    """Draw a grid line with its number; ``at`` is its position on the axis, in pixels."""
     where, right, bottom = round(at), _LEFT + int(inner[0]), _TOP + int(inner[1])
     if axis == 0 and _LEFT <= where <= right:
         cv2.line(panel, (where, _TOP), (where, bottom), _GRID, 1)
@@ -184,7 +184,7 @@ def _tick(
 
 
 def _fine(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """Points in the fractions of a pixel that OpenCV draws by."""
+    """Points in OpenCV's fixed-point pixel coordinates."""
     return np.round(points * (1 << _FINE)).astype(np.int32)
 
 

@@ -19,7 +19,7 @@ _WIDTH = 480
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where a mesh is looked at."""
+    """A view of a mesh."""
 
     name: str
     camera: Camera
@@ -31,11 +31,11 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class Sight:
-    """What the rays of a view meet: 2 x 2 rays a pixel."""
+    """Hits of the rays of a view: 2 x 2 rays a pixel."""
 
     hit: Bool[np.ndarray, "fine_h fine_w"]
     corners: Int[np.ndarray, "k 3"]
-    """Vertices of the face that each of the hitting rays meets."""
+    """Vertices of the face that each hitting ray meets."""
     light: Float[np.ndarray, "k 1"]
     """Brightness there, in [0, 1]."""
 
@@ -53,10 +53,10 @@ class Sight:
 def look(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], view: Viewpoint
 ) -> Sight:
-    """A mesh with a lamp at the camera: brightness is the cosine to its normal, which is smooth but
-    for edges.
+    """Shade a mesh with a lamp at the camera: brightness is the cosine to its normal, which is
+    smooth except at edges.
 
-    Both sides of a face are seen, as meshes of truth often have no orientation.
+    Both sides of a face are seen, as true meshes often have no orientation.
     """
     vertices = vertices.astype(np.float64)
     if view.ceiling is not None and view.up is not None and len(faces):
@@ -96,10 +96,10 @@ def _barycentric(
 def viewpoints(
     vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], camera: Camera
 ) -> list[Viewpoint]:
-    """The first camera, the one in the middle, and the whole from above without the ceiling.
+    """Views from the first and the middle camera, and from above without the ceiling.
 
-    Where all cameras look at one place, as at an object, the third is the camera that is turned
-    most from the other two.
+    If all cameras look at one point, as at an object, the third is the camera with the largest
+    rotation from the other two.
     """
     inside = camera.with_long_edge(_WIDTH)
     chosen = {"first frame": T_wc[0], "middle frame": T_wc[len(T_wc) // 2]}
@@ -117,7 +117,7 @@ def _from_above(
     width: int,
     height: int,
 ) -> Viewpoint:
-    """Nearly parallel rays from far above; what is higher than the cameras is cut away."""
+    """View with nearly parallel rays from far above; all above the cameras is cut away."""
     axes = level_axes(T_wc)
     local = vertices.astype(np.float64) @ axes.T
     low, high = np.quantile(local, [0.005, 0.995], axis=0)

@@ -1,1 +1,1 @@
-"""How far a surface is from the true one, by every protocol in use."""
+"""Errors of a surface against the true one, by every protocol in use."""

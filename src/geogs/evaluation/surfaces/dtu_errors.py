@@ -17,28 +17,28 @@ from geogs.io.mat_reader import read_mat
 from geogs.threads import on_one_torch_thread
 
 SPACING = 0.2
-"""Millimetres between samples."""
+"""Spacing of samples, millimetres."""
 MAX_DISTANCE = 20.0
-"""Millimetres from which on distances are left out."""
+"""Distances from this on are left out, millimetres."""
 
 _BELOW, _ABOVE = 60.0, 120.0
 
 
 @dataclass(frozen=True)
 class DtuReference:
-    """What the benchmark knows of a scan, in the millimetres of its world."""
+    """Reference data of a scan, in millimetres of its world."""
 
     points: Float[np.ndarray, "n 3"]
     """Points of the structured-light scanner."""
     observed: Bool[np.ndarray, "x y z"]
-    """Voxels in which the scanner could see."""
+    """Voxels observed by the scanner."""
     low: Float[np.ndarray, "3"]
     """Lower corner of the voxels' box."""
     high: Float[np.ndarray, "3"]
     resolution: float
     """Size of a voxel."""
     plane: Float[np.ndarray, "4"]
-    """What is above the table has a positive product with (x, y, z, 1)."""
+    """Plane of the table: points above have a positive product with (x, y, z, 1)."""
 
 
 @dataclass(frozen=True)
@@ -54,21 +54,21 @@ class DtuScores:
     d2s_median_mm: float
     s2d_median_mm: float
     d2s_left_out: float
-    """Part of the mesh's points 20 mm or more away, which do not count, %."""
+    """Percentage of the mesh's points 20 mm or more away, which do not count."""
     s2d_left_out: float
     data_points: int
-    """Points of the mesh, thinned, where the scanner could see."""
+    """Number of thinned points of the mesh in observed voxels."""
     scan_points: int
-    """Points of the scan above the table."""
+    """Number of points of the scan above the table."""
     protocol: str = "DTU (d2s, s2d)"
 
     @property
     def colour_limit_cm(self) -> float:
-        """Distance that pictures show as the worst."""
+        """Largest distance on the colour scale."""
         return 0.2
 
     def rows(self) -> list[tuple[str, str]]:
-        """For a table."""
+        """Rows of a table."""
         return [
             ("d2s, accuracy (mm)", f"{self.d2s_mm:.3f}"),
             ("s2d, completeness (mm)", f"{self.s2d_mm:.3f}"),
@@ -84,7 +84,7 @@ def read_dtu_reference(folder: str | Path, scan: int) -> DtuReference:
     """Read a scan from the official folder with ``ObsMask/`` and ``Points/stl/``.
 
     Raises:
-        InputError: a file is missing or is not what it should be.
+        InputError: a file is missing or malformed.
     """
     folder = Path(folder)
     mask_file = folder / "ObsMask" / f"ObsMask{scan}_10.mat"
@@ -105,12 +105,13 @@ def evaluate_dtu(mesh: Surface, reference: DtuReference, seed: int = 0) -> Surfa
 
     The mesh becomes points 0.2 mm apart: its vertices and regular samples of its triangles
     (:func:`dense_points`), shuffled, from which each point kept removes its neighbours
-    (:func:`thin`). For d2s those in observed voxels look for the nearest point of the scan. For
-    s2d the scan's points above the table look for the nearest point of the mesh in the box of the
-    voxels (60 mm more below, 120 mm above). Distances of 20 mm or more are left out of both means.
+    (:func:`thin`). For d2s those in observed voxels are compared with the nearest point of the
+    scan. For s2d the scan's points above the table are compared with the nearest point of the mesh
+    in the box of the voxels (60 mm more below, 120 mm above). Distances of 20 mm or more are left
+    out of both means.
 
     Raises:
-        InputError: no point of the mesh is where the scanner could see.
+        InputError: no point of the mesh is in an observed voxel.
     """
     from scipy.spatial import cKDTree
 
@@ -174,14 +175,14 @@ def _read_mat(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def thin(points: Float[np.ndarray, "n 3"], radius: float) -> Bool[np.ndarray, "n"]:
-    """Which points stay when each, in order, removes all later ones at most ``radius`` away.
+    """Greedy thinning: each point kept, in order, removes all later ones at most ``radius`` away.
 
-    A removed point removes none. Takes time in proportion to the points.
+    A removed point removes none. Takes time proportional to the number of points.
     """
     from geogs.evaluation.surfaces.thinning_kernels import thin_in_order
 
     kept = np.zeros(len(points), bool)
-    # From the middle, cell numbers stay small whatever the frame.
+    # Centred, so that cell numbers stay small in any frame.
     centred = points - points.mean(0) if len(points) else points
     thin_in_order(np.ascontiguousarray(centred, np.float64), radius, kept)
     return kept

@@ -1,4 +1,4 @@
-"""Iterative closest points: the last rigid motion between a reconstruction and the truth."""
+"""Iterative closest points: final rigid alignment of a reconstruction to the truth."""
 
 import numpy as np
 import torch
@@ -80,7 +80,7 @@ def _step(
     jacobian = np.concatenate([normals, np.cross(source - centre, normals)], 1)
     residual = ((target - source) * normals).sum(1)
     hessian = jacobian.T @ jacobian
-    # Directions that no normal holds (sliding along one plane) stay where they are.
+    # Directions not determined by any normal (sliding along one plane) do not change.
     xi = np.linalg.pinv(hessian, rcond=1e-6, hermitian=True) @ (jacobian.T @ residual)
     T = se3_exp(torch.from_numpy(xi)).numpy()
     to_centre = np.eye(4)

@@ -1,4 +1,4 @@
-"""Errors of the reconstruction of one object whose true mesh is known."""
+"""Errors of the reconstruction of one object with a known true mesh."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from geogs.evaluation.surfaces.triangle_tree import TriangleTree
 from geogs.threads import on_one_torch_thread
 
 MAX_DISTANCE = 0.02
-"""Metres from which on distances are left out, as in DTU."""
+"""Distances from this on are left out, as in DTU; metres."""
 ON_OBJECT = 0.001
-"""Metres up to which a seen point belongs to the object and not to what it stands on."""
+"""Largest distance of a seen point of the object, not of its support; metres."""
 
 
 @dataclass(frozen=True)
@@ -32,29 +32,29 @@ class ObjectScores:
     accuracy_median_mm: float
     completeness_median_mm: float
     precision: float
-    """Part of the result nearer than the threshold to the true mesh, %."""
+    """Percentage of the result nearer than the threshold to the true mesh."""
     recall: float
-    """Part of the truth nearer than the threshold to the result, %."""
+    """Percentage of the truth nearer than the threshold to the result."""
     f_score: float
     """Harmonic mean of the two, %."""
     threshold_mm: float
     accuracy_left_out: float
-    """Part of the result 20 mm or more away, which counts in no other number, %."""
+    """Percentage of the result 20 mm or more away, which counts in no other number."""
     completeness_left_out: float
-    """Part of the truth 20 mm or more away, which counts in no other number, %."""
+    """Percentage of the truth 20 mm or more away, which counts in no other number."""
     outside_masks: float
-    """Part of the result's area outside the masks, which does not count, %."""
+    """Percentage of the result's area outside the masks, which does not count."""
     accuracy_samples: int
     completeness_samples: int
     protocol: str = "object in its masks, distances to the surface"
 
     @property
     def colour_limit_cm(self) -> float:
-        """Distance that pictures show as the worst."""
+        """Largest distance on the colour scale."""
         return 0.2 * self.threshold_mm
 
     def rows(self) -> list[tuple[str, str]]:
-        """For a table."""
+        """Rows of a table."""
         return [
             ("Acc (mm)", f"{self.accuracy_mm:.3f}"),
             ("Comp (mm)", f"{self.completeness_mm:.3f}"),
@@ -82,21 +82,21 @@ def evaluate_object(
 ) -> SurfaceErrors[ObjectScores]:
     """Compare a mesh with an object's, both in metres and in one frame.
 
-    Accuracy: ``samples`` points of the reconstruction, uniform by area, of which those inside
-    every mask count (:func:`inside_masks`), and their exact distances to the true triangles.
-    Completeness: exact distances of ``truth_points`` (what the cameras saw, of which those within
-    1 mm of the true mesh count; else three quarters as many samples of the mesh) to the triangles
-    of the reconstruction. Distances of 2 cm or more are left out of all means, medians and ratios,
-    as in DTU; how many is a number of its own.
+    Accuracy: exact distances of ``samples`` points of the reconstruction, uniform by area, to the
+    true triangles; those inside every mask count (:func:`inside_masks`). Completeness: exact
+    distances of ``truth_points`` (seen by the cameras; those within 1 mm of the true mesh count;
+    without any, three quarters as many samples of the mesh) to the triangles of the
+    reconstruction. Distances of 2 cm or more are left out of all means, medians and ratios, as in
+    DTU; their percentage is reported.
 
     Args:
         reconstruction: the result.
         truth: the object's mesh.
         silhouettes: its masks, widened as the protocol wants (:meth:`Silhouette.dilated`).
         truth_points: points of the truth for completeness.
-        threshold: metres, for precision, recall and F-score.
-        samples: on the reconstruction.
-        seed: of the sampling.
+        threshold: threshold for precision, recall and F-score, metres.
+        samples: number of samples on the reconstruction.
+        seed: seed of the sampling.
 
     Raises:
         InputError: a mesh has no triangles, or nothing of the result is inside the masks or near.

@@ -1,4 +1,4 @@
-"""How well images agree on a surface: a measure for real scenes without a true surface."""
+"""Photo-consistency of images on a surface: a measure for real scenes without a true surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from geogs.threads import on_one_torch_thread, thread_map
 
 _LEAST_ANGLE, _BEST_ANGLE, _MOST_ANGLE = 4.0, 12.0, 30.0
 _NEIGHBOURS, _WINDOW = 4, 9
-"""Most neighbours of a view; side of the correlation window, pixels, odd."""
+"""Largest number of neighbours of a view; side of the correlation window, pixels, odd."""
 _TEXTURE = 4.0
 _OCCLUSION = 0.005
 _NOISE = 1.0
@@ -29,7 +29,7 @@ class EvaluatedPhoto:
     T_cw: Float[np.ndarray, "4 4"]
     """World to camera."""
     mask: Bool[np.ndarray, "h w"] | None = None
-    """Pixels that show the object; all if none."""
+    """Pixels of the object; all if none."""
 
 
 @dataclass(frozen=True)
@@ -39,23 +39,23 @@ class PhotoScores:
     score: float
     """Mean over the textured pixels of the masks of NCC, at least 0, and 0 where not covered, %."""
     ncc_mean: float
-    """Over covered textured pixels."""
+    """Mean over covered textured pixels."""
     ncc_median: float
     coverage: float
-    """Part of the masks that the surface covers and a neighbour sees, %."""
+    """Percentage of the masks that the surface covers and a neighbour sees."""
     views: int
-    """Views in which it was measured."""
+    """Number of evaluated views."""
     pairs: int
-    """Pairs of a view and a neighbour."""
+    """Number of pairs of a view and a neighbour."""
     textured: float
-    """Part of the masks with enough texture, %."""
+    """Percentage of the masks with enough texture."""
     window: int
     """Side of the correlation window, pixels."""
     width: int
     """Width of the images, pixels."""
 
     def rows(self) -> list[tuple[str, str]]:
-        """For a table."""
+        """Rows of a table."""
         return [
             ("score, holes count 0 (%)", f"{self.score:.2f}"),
             (f"  NCC {self.window}x{self.window}, mean / median",
@@ -67,10 +67,10 @@ class PhotoScores:
 
 @dataclass(frozen=True)
 class _Agreement:
-    """How one view agrees with its neighbours."""
+    """Agreement of one view with its neighbours."""
 
     ncc: Float32[np.ndarray, "h w"]
-    """Mean over the neighbours that see a pixel; NaN where none does."""
+    """Mean over the neighbours that see a pixel; NaN where none sees it."""
     covered: Bool[np.ndarray, "h w"]
     textured: Bool[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
@@ -84,10 +84,10 @@ def evaluate_photoconsistency(
     views: Sequence[EvaluatedPhoto],
     held_out: Sequence[int],
 ) -> PhotoScores:
-    """How well a mesh explains held-out photographs by others, without any true surface.
+    """Measure how well a mesh explains held-out photographs by others, without any true surface.
 
     For a held-out view r and each of its neighbours t (:func:`choose_neighbours`) the mesh's
-    depth in r says where a pixel of r is in t. It is visible there if it projects into the image
+    depth in r maps a pixel of r to t. It is visible there if it projects into the image
     and lies at most half a percent behind the mesh's depth in t (the largest of the four pixels
     around it). A pixel of r's mask is covered if the mesh has a depth there that is visible in at
     least one t.
@@ -95,18 +95,18 @@ def evaluate_photoconsistency(
     The grey image of t, warped into r by these depths, is compared with that of r by normalised
     cross-correlation over square windows, using only pixels where both are known, at least half
     of the window. NCC = cov / sqrt((var_r + n)(var_t + n)) with n = 1 grey level squared, so that
-    noise on plain surfaces does not count. Several neighbours are averaged. Texture is asked of r
+    noise on plain surfaces does not count. Several neighbours are averaged. Texture is tested in r
     alone (standard deviation in the window above 4 of 255 grey levels), so it is the same for
-    every mesh. All pixels of all views count alike, and nothing is random.
+    every mesh. All pixels of all views have equal weight, and nothing is random.
 
     ``score`` is the mean of max(NCC, 0) over all textured pixels of the masks, with 0 for those
-    without an NCC: neither holes nor grown surfaces, which agree nowhere, can gain by it.
+    without an NCC: neither holes nor extrapolated surfaces can increase it.
 
     Args:
-        mesh: in the world of the poses.
-        camera: of all views.
+        mesh: the mesh, in the world of the poses.
+        camera: camera of all views.
         views: photographs with true poses.
-        held_out: which of them to measure in; the neighbours may be any.
+        held_out: indices of the views to evaluate; the neighbours may be any.
 
     Raises:
         InputError: no view has a neighbour, or there is no textured pixel.
@@ -127,7 +127,7 @@ def evaluate_photoconsistency(
 
 
 def choose_neighbours(r: int, T_cw: Sequence[Float[np.ndarray, "4 4"]], most: int) -> list[int]:
-    """Views that see what view ``r`` sees from another side, by their poses alone.
+    """Choose views that see the region of view ``r`` from another side, by their poses alone.
 
     The optical axes make an angle of 4 to 30 degrees, and come nearest to each other in front of
     both cameras; those nearest to 12 degrees are taken.
@@ -192,7 +192,7 @@ def _transfer(
     T_rw: Float[np.ndarray, "4 4"],
     T_tw: Float[np.ndarray, "4 4"],
 ) -> tuple[Float32[np.ndarray, "h w 2"], Float32[np.ndarray, "h w"]]:
-    """Where each known pixel of r is in t, and its depth there; far outside where unknown."""
+    """Position of each known pixel of r in t, and its depth there; far outside where unknown."""
     T = T_tw @ np.linalg.inv(T_rw)
     rays = camera.rays().numpy()[known].astype(np.float64)
     x, y, z = T[:3, :3] @ (rays * depth[known][:, None]).T + T[:3, 3:]
@@ -211,7 +211,7 @@ def _visible(
     z: Float32[np.ndarray, "h w"],
     depth: Float32[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Inside the image and not behind the mesh's depth there."""
+    """Whether points are inside the image and not behind the mesh's depth there."""
     height, width = depth.shape
     u, v = place[..., 0], place[..., 1]
     inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
@@ -228,7 +228,7 @@ def _ncc(
 ) -> Float32[np.ndarray, "h w"]:
     """Normalised cross-correlation over the valid part of each window; NaN where that is small."""
     weight = valid.astype(np.float64)
-    # About zero, so that the differences of squares keep their digits.
+    # Centred, so that the differences of squares keep their precision.
     a, b = (a.astype(np.float64) - 128) * weight, (b.astype(np.float64) - 128) * weight
 
     def box(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

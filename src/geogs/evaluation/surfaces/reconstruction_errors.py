@@ -1,4 +1,4 @@
-"""How far a reconstructed surface is from the true one."""
+"""Errors of a reconstructed surface against the true one."""
 
 from dataclasses import dataclass
 
@@ -25,9 +25,9 @@ class ReconstructionScores:
     completeness_cm: float
     """Mean distance of the truth to the reconstruction."""
     completeness_ratio: float
-    """Part of the truth nearer than the threshold to the reconstruction, %."""
+    """Percentage of the truth nearer than the threshold to the reconstruction."""
     precision_ratio: float
-    """Part of the reconstruction nearer than the threshold to the truth, %."""
+    """Percentage of the reconstruction nearer than the threshold to the truth."""
     f_score: float
     """Harmonic mean of the two ratios, %."""
     chamfer_cm: float
@@ -40,15 +40,15 @@ class ReconstructionScores:
     icp_shift_cm: float
     """Mean motion of the samples by ICP; 0 where it was not used."""
     protocol: str = "area-weighted (NICE-SLAM), distances to the surface"
-    """How the errors are defined."""
+    """Definition of the errors."""
 
     @property
     def colour_limit_cm(self) -> float:
-        """Distance that pictures show as the worst."""
+        """Largest distance on the colour scale."""
         return 2 * self.threshold_cm
 
     def rows(self) -> list[tuple[str, str]]:
-        """For a table."""
+        """Rows of a table."""
         return [
             ("Acc (cm)", f"{self.accuracy_cm:.3f}"),
             ("Comp (cm)", f"{self.completeness_cm:.3f}"),
@@ -76,16 +76,16 @@ def evaluate_reconstruction(
     """Compare a reconstruction with the truth, both in metres and in the truth's frame.
 
     The area-weighted measure of NICE-SLAM and iMAP: ``samples`` points uniform by area on each
-    side, unsquared nearest distances, means and the part below ``threshold`` (metres). Two
+    side, unsquared nearest distances, means and the fraction below ``threshold`` (metres). Two
     details differ from the usual scripts and make the result independent of sampling density:
     distances go to the surface itself, exactly (see :class:`SurfaceDistance`), not to samples of
     it; and culling acts on samples, not on whole triangles.
-    :mod:`geogs.evaluation.surfaces.toolbox` has the scripts' own ways.
+    :mod:`geogs.evaluation.surfaces.toolbox` has the scripts' own measures.
 
     Accuracy is measured against ``truth``, completeness on ``truth_points`` where given (say, only
-    what the camera saw). With ``visibility`` the samples of the truth are limited to what the
-    camera saw (and, with ``cull_reconstruction``, those of the reconstruction to the region it
-    saw). With ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
+    points seen by the camera). With ``visibility`` the samples of the truth are limited to the
+    region seen by the camera (and, with ``cull_reconstruction``, those of the reconstruction,
+    too). With ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
     """
     rng = np.random.default_rng(seed)
     if not reconstruction.is_mesh or not reconstruction.areas.sum() > 0:
@@ -110,7 +110,7 @@ def evaluate_reconstruction(
 def _reference_samples(
     truth: Surface, visibility: Visibility | None, samples: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Samples of the truth, of which the camera saw about ``samples`` where it matters."""
+    """Samples of the truth; with ``visibility``, about ``samples`` that the camera saw."""
     if visibility is None:
         return sample_surface(truth, samples, rng)[0]
     points = sample_surface(truth, 5 * samples, rng)[0]

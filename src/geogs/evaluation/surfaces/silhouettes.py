@@ -1,4 +1,4 @@
-"""Which part of a surface belongs to the object, by its masks in all views."""
+"""Parts of a surface that belong to the object, by its masks in all views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from geogs.geometry.camera import Camera
 from geogs.threads import thread_map
 
 DILATION = 24.0
-"""Pixels by which masks of an image of FULL_WIDTH are widened."""
+"""Dilation of the masks, in pixels of an image of FULL_WIDTH."""
 FULL_WIDTH = 1600
 
 _BATCH = 200_000
@@ -21,7 +21,7 @@ _BATCH = 200_000
 
 @dataclass(frozen=True)
 class Silhouette:
-    """The pixels of a view that show the object."""
+    """Pixels of the object in a view."""
 
     mask: Bool[np.ndarray, "h w"]
     camera: Camera
@@ -30,7 +30,7 @@ class Silhouette:
     """World to camera."""
 
     def dilated(self) -> "Silhouette":
-        """Widened by a disk of 24 pixels of an image 1600 wide, as DTU's protocol does."""
+        """Dilate by a disk of 24 pixels of an image 1600 wide, as in DTU's protocol."""
         return replace(self, mask=dilate(self.mask, DILATION * self.camera.width / FULL_WIDTH))
 
 
@@ -62,8 +62,8 @@ def inside_masks(
 ) -> Bool[np.ndarray, "n"]:
     """Points that are on the mask in every view whose image contains them.
 
-    The pixel nearest to the projection decides. What is outside an image, or behind its camera,
-    is not judged by it: the rule of 2DGS's culling of DTU meshes.
+    The pixel nearest to the projection decides. Points outside an image, or behind its camera, are
+    not tested in it: the rule of 2DGS's culling of DTU meshes.
     """
     parts = np.split(np.ascontiguousarray(points, np.float64), range(_BATCH, len(points), _BATCH))
     return np.concatenate(thread_map(partial(_inside, silhouettes=silhouettes), parts))

@@ -10,9 +10,8 @@ from geogs.evaluation.surfaces.triangle_tree import TriangleTree
 class SurfaceDistance:
     """Distances from points to a surface.
 
-    To a mesh they are those to the nearest of all triangles, so that how densely it is tessellated
-    does not enter. To a point set they are distances to the nearest point, which include its
-    spacing.
+    For a mesh they are exact distances to the nearest triangle, independent of the tessellation.
+    For a point set they are distances to the nearest point, which include its spacing.
     """
 
     def __init__(self, surface: Surface) -> None:

@@ -17,16 +17,16 @@ class SurfaceScores(Protocol):
 
     @property
     def protocol(self) -> str:
-        """Its name."""
+        """Name of the protocol."""
         ...
 
     @property
     def colour_limit_cm(self) -> float:
-        """Distance that pictures show as the worst."""
+        """Largest distance on the colour scale."""
         ...
 
     def rows(self) -> list[tuple[str, str]]:
-        """Name with unit, and value, of what a table shows."""
+        """Rows of a table: name with unit, and value."""
         ...
 
 
@@ -40,20 +40,20 @@ class SurfaceErrors(Generic[S_co]):
     scores: S_co
     reconstruction_points: Float[np.ndarray, "n 3"]
     accuracy: Float[np.ndarray, "n"]
-    """Distance of each to the truth; inf where it is left out."""
+    """Distance of each point to the truth; inf where it is left out."""
 
 
 @dataclass(frozen=True)
 class SurfaceComparison:
-    """Scores, and what pictures of the errors need, in the frame of the truth."""
+    """Scores, and data for pictures of the errors, in the frame of the truth."""
 
     scores: SurfaceScores
     mesh: Surface
     truth: Surface | None
     """None where the truth is no surface."""
     points: Float[np.ndarray, "n 3"]
-    """Where the reconstruction was compared."""
+    """Compared points of the reconstruction."""
     distance: Float[np.ndarray, "n"]
-    """To the truth, metres; inf where it did not count."""
+    """Distance to the truth, metres; inf where it did not count."""
     reach: float = np.inf
-    """How far from the points the mesh was still compared; beyond, pictures show no error."""
+    """Largest distance from these points at which pictures show the mesh's error."""

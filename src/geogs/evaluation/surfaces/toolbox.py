@@ -1,8 +1,8 @@
-"""Reconstruction errors exactly as the scripts behind published tables compute them.
+"""Reconstruction errors exactly as in the scripts behind published tables.
 
 Both measures first move the reconstruction by point-to-point ICP of its vertices (0.1 m), and
-take unsquared distances between points. They differ in the points. reconstruction_errors has
-the measure to prefer, which depends on neither tessellation nor sampling.
+take unsquared distances between points. They differ in the points. Prefer the measure of
+reconstruction_errors, which depends on neither tessellation nor sampling.
 """
 
 from dataclasses import replace
@@ -34,12 +34,12 @@ def evaluate_vertices(
     """Vertex-weighted errors of a mesh in metres, in the frame of the true mesh.
 
     Accuracy is the mean over the vertices of the reconstruction, completeness over those of the
-    truth, so what is finely tessellated counts more. The mesh with more vertices says how many
-    points the other one answers with: if that is the reconstruction, its vertices are compared
-    with as many samples of the truth, and the vertices of the truth with those of the
-    reconstruction. Otherwise its vertices are compared with those of the truth, and the truth's
-    with as many samples of the reconstruction as the truth has vertices. Samples are independent
-    and uniform by area; vertices at one place count once, and those without a triangle not at all.
+    truth, so finely tessellated parts count more. The mesh with more vertices determines the number
+    of points of the other: if that is the reconstruction, its vertices are compared with as many
+    samples of the truth, and the vertices of the truth with those of the reconstruction.
+    Otherwise its vertices are compared with those of the truth, and the truth's with as many
+    samples of the reconstruction as the truth has vertices. Samples are independent and uniform by
+    area; vertices at one position count once, and those without a triangle not at all.
 
     Source: evaluate_3d_reconstruction_lib as Splat-SLAM and HI-SLAM2 call it. Its tables come from
     the distances of the vertices, which replace those of the samples before the means are taken.
@@ -98,7 +98,7 @@ def _require_meshes(reconstruction: Surface, truth: Surface) -> None:
 
 
 def _without_duplicates(surface: Surface) -> Surface:
-    """Vertices at one place made one, those without a triangle dropped, as trimesh loads a mesh."""
+    """Merge vertices at one position, and drop those without a triangle, like trimesh."""
     surface = surface.part(np.ones(len(surface.faces), bool))
     grid = np.rint(surface.vertices / _SAME_VERTEX).astype(np.int64)
     first, number = np.unique(grid, axis=0, return_index=True, return_inverse=True)[1:]

@@ -14,10 +14,10 @@ _BATCH = 8_192
 
 
 class TriangleTree:
-    """A tree of bounding boxes over a mesh's triangles, put in order along a Z-curve.
+    """A tree of bounding boxes over a mesh's triangles, ordered along a Z-curve.
 
-    Every distance is that to the nearest of all triangles. Points are asked for in that order, too,
-    as each is bounded by the one before it.
+    Distances are exact, to the nearest of all triangles. Points are queried in the same order, as
+    each distance is bounded by the one before it.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -77,7 +77,7 @@ def _boxes(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "k 6"]:
 
 
 def _along_curve(points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
-    """The order of points along a Z-curve, of steps of their largest extent."""
+    """The order of points along a Z-curve, quantised by their largest extent."""
     if not len(points):
         return np.zeros(0, np.int64)
     low, extent = points.min(0), np.ptp(points, axis=0).max()

@@ -1,4 +1,4 @@
-"""What the cameras of a trajectory saw of a surface: point by point, or triangle by triangle."""
+"""Visibility of a surface in the cameras of a trajectory, by point or by triangle."""
 
 from typing import Literal
 
@@ -13,9 +13,9 @@ from geogs.geometry.camera import Camera
 CullingRule = Literal["frustum", "occlusion"]
 
 _TOLERANCE = 0.03
-"""Metres behind the occluder's depth up to which a point is seen."""
+"""Largest distance of a seen point behind the occluder's depth, metres."""
 _LONG_EDGE = 320
-"""Pixels of the depth maps, at most."""
+"""Largest longer side of the depth maps, pixels."""
 
 
 class Visibility:
@@ -23,8 +23,8 @@ class Visibility:
 
     A point is seen by a view if it projects into the image in front of the camera and lies at
     most 3 cm behind the occluder's depth there (the rule of Neural RGB-D and GO-Surf). For a
-    reconstruction the same rule leaves out what lies outside all frusta or hidden behind the true
-    surface; what stands in seen free space stays, and counts as error.
+    reconstruction the same rule leaves out parts outside all frusta or hidden behind the true
+    surface; parts in observed free space stay, and count as errors.
     """
 
     def __init__(self, occluder: Surface, camera: Camera, T_cw: Float[np.ndarray, "v 4 4"]) -> None:
@@ -38,7 +38,7 @@ class Visibility:
         ]
 
     def seen(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points at least one view sees."""
+        """Return which points at least one view sees."""
         result = np.zeros(len(points), bool)
         for T, depth in zip(self._T_cw, self._depths, strict=True):
             rest = np.flatnonzero(~result)
@@ -59,18 +59,18 @@ def cull_mesh(
     rule: CullingRule,
     occluder: Surface | None = None,
 ) -> Surface:
-    """The triangles that the cameras saw by one of two customary rules.
+    """Keep the triangles that the cameras saw, by one of two common rules.
 
     ``frustum`` (iMAP, NICE-SLAM) leaves out a triangle if none of its vertices is inside any
-    image in front of the camera; hidden ones stay. ``occlusion`` (Neural RGB-D, GO-Surf) asks
-    besides that a vertex be at most 3 cm behind the nearest surface in one of the views.
+    image in front of the camera; hidden ones stay. ``occlusion`` (Neural RGB-D, GO-Surf) also
+    requires a vertex at most 3 cm behind the nearest surface in one of the views.
 
     Args:
-        mesh: what to cut, in metres.
-        camera: of every view.
+        mesh: the mesh to cut, in metres.
+        camera: camera of every view.
         T_cw: world to camera of the views, in the frame of the mesh.
-        rule: which of the two.
-        occluder: what hides parts of the mesh; the mesh itself if none.
+        rule: one of the two rules.
+        occluder: occluding mesh; the mesh itself if none.
 
     Raises:
         InputError: nothing is left.
@@ -87,7 +87,7 @@ def cull_mesh(
 def in_frustum(
     points: Float[np.ndarray, "n 3"], camera: Camera, T_cw: Float[np.ndarray, "v 4 4"]
 ) -> Bool[np.ndarray, "n"]:
-    """Which points at least one view has inside its image, in front of it."""
+    """Return which points project into the image of at least one view, in front of it."""
     result = np.zeros(len(points), bool)
     for T in T_cw:
         rest = np.flatnonzero(~result)
@@ -100,7 +100,7 @@ def in_frustum(
 def _projected(
     points: Float[np.ndarray, "n 3"], camera: Camera, T_cw: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Pixels and depths of points; pixels mean something only where z > 0."""
+    """Pixels and depths of points; pixels are valid only where z > 0."""
     x, y, z = (points @ T_cw[:3, :3].T + T_cw[:3, 3]).T
     safe = np.where(z > 0, z, 1.0)
     return camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy, z

@@ -20,7 +20,7 @@ class LiveAddress:
 
     @property
     def name(self) -> str:
-        """To call it in messages and folders: without what an URL says of users and passwords."""
+        """Name in messages and folders: without the user and password of an URL."""
         if self.kind == "camera":
             return f"camera-{self.target}"
         if self.kind == "play":
@@ -34,7 +34,7 @@ class LiveAddress:
 def live_address(source: str | Path) -> LiveAddress | None:
     """The address ``camera:0``, ``rtsp://…``, ``-`` or ``play:FILE``; none where it is a path.
 
-    A path made of an URL has lost one of its slashes, which counts as there.
+    A path made of an URL has lost one of its slashes; it still counts as an URL.
     """
     words = str(source)
     if words == "-":

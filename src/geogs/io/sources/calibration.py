@@ -9,13 +9,13 @@ from geogs.geometry.camera import Camera
 from geogs.types import FoundLens
 
 _LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0
-"""Focal lengths by the longer side of the image: fields of view from 157 down to 0.6 degrees."""
+"""Limits of focal length / longer image side: fields of view from 157 down to 0.6 degrees."""
 _LARGEST_DISTORTION = 1e5
 GUESS = 0.35
-"""Relative standard deviation of a focal length that is only assumed: cameras that people hold have
+"""Relative standard deviation of a focal length that is only assumed: hand-held cameras have
 fields of view of 40 to 100 degrees."""
 _LONGEST_EDGE = 1 << 20
-"""Pixels."""
+"""Longest image side in pixels."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class FocalRefinement:
     deviation: float | None = None
     """Standard deviation of fx in pixels of the source's images; none where there is a failure."""
     deviations: tuple[float, float] | None = None
-    """Standard deviations of k1 and k2; none where they were not found beside it."""
+    """Standard deviations of k1 and k2; none where they were not estimated."""
     keyframes: int = 0
     frames: int = 0
-    """Frames that were looked at."""
+    """Number of frames examined."""
     failure: str | None = None
     """Why it failed."""
     is_explained: bool = True
-    """Whether any camera explains the motion in its first views; else moving objects may decide
-    what is estimated from all matches later, too."""
+    """Whether some camera explains the motion in the first views; if none does, moving objects may
+    also dominate later estimates from all matches."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class Calibration:
     distortion: tuple[float, ...] = ()
     """k1, k2, p1, p2(, k3(, k4, k5, k6)), empty for a pinhole; k1, k2, k3, k4 of a fisheye."""
     width: int | None = None
-    """Image size the numbers hold for; none where the description does not say."""
+    """Image size the numbers hold for; none where it is not given."""
     height: int | None = None
     origin: str = "given"
-    """Where the numbers come from, for the log and ``intrinsics.json``."""
+    """Origin of the numbers, for the log and ``intrinsics.json``."""
     is_guess: bool = False
     """Whether the focal length is only assumed."""
     is_nominal: bool = False
@@ -121,7 +121,7 @@ class Calibration:
         return 0.0 if found is None else found / self.fx
 
     def camera(self) -> Camera:
-        """The pinhole part, once the size is known."""
+        """The pinhole part. The size must be known."""
         return Camera(self.fx, self.fy, self.cx, self.cy, *self._size())
 
     @property
@@ -132,8 +132,8 @@ class Calibration:
         return ",".join(name + [f"{value:.6g}" for value in values])
 
     def with_lens(self, found: FoundLens) -> "Calibration":
-        """The calibration with the distortion that is left in images straightened by it, once the
-        size is known."""
+        """Return the calibration with the distortion added that was found in images undistorted by
+        it. The size must be known."""
         bend, shift = (found.k1, found.k2), (found.right, found.down)
         camera, distortion = with_bend(
             self.camera(), self.distortion, self.lens, bend, found.focal, shift
@@ -147,7 +147,7 @@ class Calibration:
             return bent
         own = found.deviation_k1, found.deviation_k2
         said = self.refinement or FocalRefinement()
-        is_explained = said.is_explained or found.varies  # no camera that stays does
+        is_explained = said.is_explained or found.varies  # no constant camera does
         said = replace(said, deviations=own, failure=None, is_explained=is_explained)
         return replace(
             bent, fx=camera.fx, fy=camera.fy, is_guess=False, is_nominal=False,
@@ -167,7 +167,7 @@ class Calibration:
             width: width of the images as shown, in pixels.
             height: their height.
             quarter_turns: clockwise quarter turns between the stored and the shown images. A
-                calibration made for the stored ones is turned along: recognised by its size, or,
+                calibration made for the stored ones is rotated too: recognised by its size, or,
                 where it has none, by its principal point.
 
         Raises:
@@ -203,7 +203,7 @@ class Calibration:
         )  # fmt: skip
 
     def _check_plausible(self, camera: Camera) -> None:
-        """Raises InputError for a focal length that no camera of such images has."""
+        """Raise InputError for an implausible focal length."""
         least, most = _LEAST_FOCAL * camera.long_edge, _MOST_FOCAL * camera.long_edge
         squeeze = max(camera.fx / camera.fy, camera.fy / camera.fx)
         if not all(least <= focal <= most for focal in (camera.fx, camera.fy)) or squeeze > 4:

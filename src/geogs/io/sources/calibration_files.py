@@ -48,7 +48,7 @@ _COLMAP_MODELS: dict[str, tuple[int | None, ...]] = {
     "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),
 }
 FISHEYE = "fisheye"
-"""Begins the numbers of a fisheye."""
+"""Word before the numbers of a fisheye."""
 _FISHEYES = (FISHEYE, "equidistant", "opencv_fisheye", "kannala_brandt", "kb4")
 """Names of a fisheye in files, in lower case."""
 _OTHER_LENSES = (
@@ -139,7 +139,7 @@ def _text_of_settings(path: Path) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """The missing entry, if that is the error; nothing of the file's content."""
+    """The missing entry, if that is the error; the file's content is never quoted."""
     return f" (no entry {error})" if isinstance(error, KeyError) else ""
 
 
@@ -221,7 +221,7 @@ def calibration_from_colmap(
 
 
 def calibration_from_document(document: dict[str, Any], path: Path) -> Calibration:
-    """Translate a camera of :func:`camera_document`; raises what a document may, see UNUSABLE."""
+    """Translate a camera of :func:`camera_document`; raises the errors of UNUSABLE."""
     _refuse_others(str(document.get("camera_model", "")), path)
     lens = _lens(str(document.get("distortion_model", "")), path)
     if "intrinsics" in document:  # EuRoC and Kalibr

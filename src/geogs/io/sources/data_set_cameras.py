@@ -23,7 +23,7 @@ SAME = 1e-6
 
 
 def kitti_rows(text: str) -> dict[str, list[float]]:
-    """The rows of numbers of KITTI's calibration by their names; those of words are left out."""
+    """Rows of numbers of a KITTI calibration, by name; rows of words are left out."""
     rows = {}
     for name, words in _ROW.findall(text):
         try:
@@ -39,7 +39,7 @@ def is_kitti(text: str) -> bool:
 
 
 def kitti_camera(path: Path, number: int | None, rectified: bool = True) -> Calibration:
-    """The camera ``number`` (0 to 3) of a file of KITTI; without one that of all.
+    """Read camera ``number`` (0 to 3) of a KITTI file; without a number, the camera they share.
 
     Raises:
         InputError: it is not there, or cameras differ and none was named.
@@ -62,7 +62,7 @@ def kitti_offset(path: Path, number: int) -> Float64[np.ndarray, "3"]:
     """Position of camera 0 in the axes of a rectified camera, metres.
 
     Raises:
-        InputError: the file does not say.
+        InputError: the file does not hold it.
     """
     rows = kitti_rows(read_text(path))
     P = rows.get(f"P{number}", rows.get(f"P_rect_{number:02d}", []))

@@ -1,4 +1,4 @@
-"""Depth of a sensor: pictures of it beside the images, registered to the image's pixels."""
+"""Sensor depth: depth images beside the colour images, registered to their pixels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +17,17 @@ from geogs.io.sources.undistort import Rectifier
 SAME_SURFACE = 0.03
 """Relative difference of depth up to which neighbouring pixels are interpolated."""
 INVALID = 65535
-"""Written by some sensors where depth is unknown, beside 0."""
+"""Value for unknown depth of some sensors, besides 0."""
 
 LEAST_CONFIDENCE = 1
 """Least confidence of a phone's lidar (0 low, 1 medium, 2 high) at which a depth is taken."""
 LONGEST = 32_000
-"""Pixels of a side beyond which OpenCV interpolates nothing."""
+"""Longest side, in pixels, that OpenCV can interpolate."""
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A depth sensor that does not see from where the colour camera does."""
+    """A depth sensor at another position than the colour camera."""
 
     camera: Camera
     T_colour_depth: tuple[float, float, float]
@@ -39,7 +39,7 @@ class RecordedDepth(Protocol):
     """A depth map as stored."""
 
     sensor: DepthCamera | None
-    """Its camera; none where its pixels are those of the colour image, at whatever size."""
+    """Depth camera; none where its pixels are those of the colour image, at any size."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """The depth of its own pixels, 0 where unknown; None where it cannot be read."""
@@ -48,17 +48,17 @@ class RecordedDepth(Protocol):
 
 @dataclass(frozen=True)
 class DepthFile:
-    """A picture of depth as stored."""
+    """A depth image as stored."""
 
     path: Path
     per_metre: float = 1000.0
-    """Units of the picture to the metre."""
+    """Units per metre."""
     sensor: DepthCamera | None = None
-    """Its camera; none where its pixels are those of the colour image, at whatever size."""
+    """Depth camera; none where its pixels are those of the colour image, at any size."""
     confidence: Path | None = None
     """Picture of the confidence of each pixel, see ``LEAST_CONFIDENCE``."""
     quarter_turns: int = 0
-    """Clockwise, from the picture as stored to the upright image."""
+    """Clockwise quarter turns from the stored picture to the upright image."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """The depth of the picture's own pixels, 0 where unknown; None where it cannot be read."""
@@ -78,7 +78,7 @@ class DepthFile:
 
 
 def depth_beside(path: Path, confidence: Path | None = None) -> DepthFile | None:
-    """A picture of millimetres, and of their confidence, as far as they are there."""
+    """Return the depth file in millimetres, with its confidence, where these files exist."""
     if not path.is_file():
         return None
     is_there = confidence is not None and confidence.is_file()
@@ -87,15 +87,15 @@ def depth_beside(path: Path, confidence: Path | None = None) -> DepthFile | None
 
 @dataclass(frozen=True)
 class RectifiedDepth:
-    """Depth of the pixels of a working image, made when it is asked for."""
+    """Depth at the pixels of a working image, computed on demand."""
 
     file: RecordedDepth
     colour: Calibration
     """Camera of the stored image."""
     rectifier: Rectifier
-    """Made the working image."""
+    """Rectifier that made the working image."""
     offsets: Float[np.ndarray, "h w 2"] | None = None
-    """Offsets by which the rows of a rolling shutter were rectified."""
+    """Pixel offsets of the rolling-shutter rectification."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """Depth z in the working image's camera; 0 where unknown, None where it cannot be read."""
@@ -119,7 +119,7 @@ def sampled(
 ) -> Float32[np.ndarray, "h2 w2"]:
     """Depth at any columns and rows: interpolated on a surface, the nearest pixel's at its edge.
 
-    Inverse depth is interpolated, which is linear on planes. 0 where nothing is known.
+    Inverse depth is interpolated, which is linear on planes. 0 where unknown.
     """
     known = (depth > 0).astype(np.float32)
     inverse = known / np.where(known > 0, depth, 1)
@@ -160,7 +160,7 @@ def _nearest_first(
 ) -> Float32[np.ndarray, "h w"]:
     u, v = np.rint(pixels).T
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & np.isfinite(z)
-    order = np.argsort(-z[inside], kind="stable")  # what is written last stays
+    order = np.argsort(-z[inside], kind="stable")  # the last value written stays
     at = (v[inside].astype(int) * width + u[inside].astype(int))[order]
     out = np.zeros(width * height, np.float32)
     out[at] = z[inside][order]

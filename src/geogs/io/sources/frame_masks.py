@@ -1,7 +1,7 @@
-"""A folder with a mask for each image, and how a masked-out pixel is marked in the image itself.
+"""A folder with a mask for each image, and the mark of masked-out pixels in the image itself.
 
-Masked-out pixels are black, and a valid pixel that is quite black becomes one level brighter: so
-the mask goes wherever the image does.
+Masked-out pixels are black, and valid pixels that are black become one level brighter: so
+the image carries its mask.
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from geogs.errors import InputError
 from geogs.io.pictures import read_mask
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm"})
-"""Names that are taken for masks."""
+"""Suffixes of mask files."""
 
 
 class FrameMasks:
@@ -30,7 +30,7 @@ class FrameMasks:
     def find(self, name: str) -> Path | None:
         """The mask of ``0042.jpg`` or of frame ``42``: ``0042.png``, ``0042.jpg.png``, ``42.png``.
 
-        None where there is none: then all pixels are valid.
+        None where there is no mask: then all pixels are valid.
         """
         stem = Path(name).stem
         for known in (name, stem):
@@ -39,7 +39,7 @@ class FrameMasks:
         return self._by_number.get(int(stem)) if stem.isdecimal() else None
 
     def read(self, name: str, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"] | None:
-        """The valid pixels of an image; none where all are.
+        """Read the valid pixels of an image; none where all are valid.
 
         Raises:
             InputError: the mask is damaged.

@@ -1,4 +1,4 @@
-"""A source: one or several recordings of a place, read as a single stream of frames."""
+"""A source: one or several recordings of a scene, read as a single stream of frames."""
 
 import copy
 import logging
@@ -50,19 +50,19 @@ class RecordingPlace:
     shift: float = 0.0
     """Seconds from its own clock to the joint time."""
     frames: int = 0
-    """Given."""
+    """Number of frames yielded."""
     skipped: int = 0
-    """Images before the last of them that could not be read, or are of another size."""
+    """Number of images so far that could not be read, or are of another size."""
     damaged: int = 0
-    """Images among them of which a part is damaged."""
+    """Number of frames of which a part is damaged."""
 
     @property
     def read(self) -> int:
-        """Images so far."""
+        """Number of images read so far."""
         return self.frames + self.skipped
 
     def after(self, raw: RawFrame) -> "RecordingPlace":
-        """The place after one more image, which is logged if it is the first of its faults."""
+        """Progress after one more image; the first skipped and the first damaged one are logged."""
         if raw.image is None:
             if not self.skipped:
                 _log.warning("%s %s; skipped.", raw.label, raw.why_not)
@@ -77,11 +77,11 @@ class ReadingPlace:
     """Progress of reading a source."""
 
     frames: int = 0
-    """Given, of all recordings together."""
+    """Number of frames yielded, of all recordings together."""
     time: float = 0.0
-    """Time of the last, seconds in the joint time."""
+    """Joint time of the last frame, in seconds."""
     recordings: tuple[RecordingPlace, ...] = ()
-    """Progress in each recording that was begun."""
+    """Progress in each started recording."""
 
     @property
     def skipped(self) -> int:
@@ -97,7 +97,7 @@ class ReadingPlace:
 class Source:
     """Frames of the recordings one after the other, numbered and timed through.
 
-    They are at working resolution, undistorted, in time order, as one pinhole camera took them all,
+    They are at working resolution, undistorted, in time order, all of one pinhole camera,
     and can be iterated over repeatedly. No motion links the first frame of a recording to the last
     of the one before.
     """
@@ -119,26 +119,26 @@ class Source:
         self.shutter = first.shutter
         """The shutter by which rows are rectified."""
         self.mask = first.mask
-        """Pixels of every frame that may show the scene; none where all do."""
+        """Valid pixels of every frame; none where all are valid."""
         self.fps = first.fps
         """Frames per second after the stride, nominal."""
         self.recorded_fps = first.reader.info.fps
-        """Images per second before it."""
+        """Images per second before the stride."""
         lengths = [images.length for images in recordings]
         self.length = None if None in lengths else sum(n for n in lengths if n is not None)
-        """Frames to expect, unreadable ones included; none where it is not known beforehand."""
+        """Expected number of frames, unreadable ones included; none where not known beforehand."""
         self.black_is_masked = first.black_is_masked
-        """Whether pixels of frames that are quite black are masked out."""
+        """Whether black pixels of frames are masked out."""
         self.uses_depth = any(images.uses_depth for images in recordings)
-        """Whether frames of any recording come with the depth that a sensor measured."""
+        """Whether frames of any recording have sensor depth."""
         self.depths_found = [images.depth_found for images in recordings]
-        """A sentence on the depth of a sensor for each recording."""
+        """A sentence on the sensor depth for each recording."""
         self.uses_poses = any(images.poses.is_used for images in recordings)
-        """Whether frames of any recording come with poses of another tracker, as priors."""
+        """Whether frames of any recording have pose priors of another tracker."""
         self.is_live = first.is_live
-        """Whether frames come at their own pace; such a recording is read alone."""
+        """Whether the source is live; such a recording is read alone."""
         self.is_calibration_open = any(images.is_calibration_open for images in recordings)
-        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        """Whether the focal length is a guess or nominal, not given by user or data set."""
         self.is_overlay_open = first.is_overlay_open
         """Whether no mask was given, and static overlays may be masked out."""
         self.is_shutter_open = first.is_shutter_open
@@ -147,7 +147,7 @@ class Source:
         """Progress of reading, at each frame of this iteration."""
 
     def __len__(self) -> int:
-        """``length``. Raises TypeError where it is not known."""
+        """Return ``length``. Raises TypeError where it is not known."""
         if self.length is None:
             raise TypeError(f"It is not known beforehand how many frames {self.name} has.")
         return self.length
@@ -176,7 +176,7 @@ class Source:
 
     @property
     def intrinsics_origin(self) -> str:
-        """Where the intrinsics come from."""
+        """Origin of the intrinsics."""
         return self.calibration.origin
 
     def with_calibration(self, calibration: Calibration) -> "Source":
@@ -194,7 +194,7 @@ class Source:
         return Source([images.known_better(shutter=shutter) for images in self._recordings])
 
     def with_focal(self, focal: float) -> "Source":
-        """The same frames, as a pinhole of that focal length sees them."""
+        """The same frames, rendered for a pinhole of that focal length."""
         return Source([images.known_better(focal=focal) for images in self._recordings])
 
     def without_overlay(self, overlay: Bool[np.ndarray, "h w"]) -> "Source":
@@ -202,8 +202,8 @@ class Source:
         return Source([images.known_better(overlay=overlay) for images in self._recordings])
 
     def spread(self, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """So many images from all over the recordings, at working size, lens and rows as stored;
-        fewer, or none, where a recording can only be read from its beginning."""
+        """Read ``count`` images spread over the recordings, at working size, lens and rows as
+        stored; fewer, or none, where a recording can only be read from its beginning."""
         each = -(-count // len(self._recordings))
         found = [raw.image for images in self._recordings for raw in images.spread(each)]
         return [image for image in found if image is not None]
@@ -214,11 +214,11 @@ class Source:
         return self._recordings[0].rolling_camera
 
     def as_recorded(self) -> Generator[Frame, None, None]:
-        """All frames of the first recording, whatever the stride, with their rows as they came."""
+        """All frames of the first recording, at stride 1, without row rectification."""
         return iter(Source([self._recordings[0].as_recorded()]))
 
     def fingerprint(self) -> str:
-        """Sixteen digits for each recording that change with the names and sizes of its files."""
+        """Sixteen digits per recording that depend on the names and sizes of its files."""
         return "-".join(fingerprint_of(images.reader.paths) for images in self._recordings)
 
     def __iter__(self) -> Generator[Frame, None, None]:
@@ -230,10 +230,10 @@ class Source:
         return self.frames_after(ReadingPlace())
 
     def frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
-        """Yield the frames after a place; otherwise as the iteration over all.
+        """Yield the frames after a reading position; like the iteration over all.
 
         Raises:
-            InputError: the place is none of this source.
+            InputError: the position does not fit this source.
         """
         if len(place.recordings) > len(self._recordings):
             raise InputError(f"{self.name} is not what it was when the run began.")
@@ -245,7 +245,7 @@ class Source:
             yield from self._frames_of(number)
 
     def _frames_of(self, number: int) -> Generator[Frame, None, None]:
-        """The frames of a recording after the present place."""
+        """The frames of a recording after the present position."""
         images, previous = self._recordings[number], self.place.recordings[:number]
         here = (*self.place.recordings, RecordingPlace())[number]
         index, end = self.place.frames, self.place.time

@@ -1,4 +1,4 @@
-"""Which intrinsics a source gets: the user's, the data set's, the photograph's, or a guess."""
+"""Choice of a source's intrinsics: the user's, the data set's, the photograph's, or a guess."""
 
 import logging
 import math
@@ -31,7 +31,7 @@ def resolve_intrinsics(
 
     Args:
         option: ``auto``, the path of a calibration file, or comma-separated numbers.
-        known: what the data set or the photographs say; used for ``auto``.
+        known: calibration of the data set or the photographs; used for ``auto``.
         width: width of the images as shown, in pixels.
         height: their height.
         quarter_turns: clockwise turns from the stored to the shown images, see Calibration.fit.
@@ -39,7 +39,7 @@ def resolve_intrinsics(
     if option.strip().lower() == "auto":
         calibration = known or guess_calibration(width, height)
         if calibration.is_guess:
-            # No warning yet: a run finds the focal length from the video.
+            # No warning yet: a run estimates the focal length from the video.
             _log.info("The intrinsics are unknown; assuming %s.", calibration.origin)
         return calibration.fit(width, height, quarter_turns)
     return _from_option(option).fit(width, height, quarter_turns)
@@ -70,7 +70,7 @@ def calibration_from_exif(image: Path) -> Calibration | None:
         with header_read(image) as photograph:
             exif: Mapping[int, object] = photograph.getexif().get_ifd(_EXIF_IFD)
             width, height = photograph.size
-    except Exception:  # whatever damaged EXIF makes its reader stumble over
+    except Exception:  # damaged EXIF may raise any exception
         return None
     equivalent = exif.get(_FOCAL_LENGTH_35MM)
     if not isinstance(equivalent, int | float) or not 3 <= equivalent <= 3000:  # or a wrong entry

@@ -1,4 +1,4 @@
-"""The layouts of data sets that are known, in the order in which they are looked for."""
+"""The known layouts of data sets, in the order in which they are tried."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -126,6 +126,6 @@ LAYOUTS: tuple[Layout, ...] = (
         "rgb with the pictures, or metadata.json with K, w, h and poses,",
     ),
 )  # fmt: skip
-"""Earlier ones win."""
+"""Known layouts; the first that matches is used."""
 WITH_MODEL = tuple(layout for layout in LAYOUTS if layout.name in ("ScanNet++", "ETH3D"))
 """Layouts whose poses are a COLMAP model."""

@@ -10,9 +10,9 @@ from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.reader import Reader
 
 _MOST_FOLDERS = 200
-"""Folders in a folder that are looked into for a sequence."""
+"""Largest number of sub-folders searched for a sequence."""
 _NAMED = 5
-"""Sequences that a sentence names."""
+"""Largest number of sequences that a message names."""
 
 
 @dataclass(frozen=True)
@@ -20,17 +20,17 @@ class Layout:
     """Files and folders of a data set."""
 
     name: str
-    """Name of the data set, for sentences."""
+    """Name of the data set, for messages."""
     is_like: Callable[[Path], object] | None
-    """Whether a folder is a sequence; None: it is where one of ``pictures`` has images."""
+    """Test whether a folder is a sequence; none: one of ``pictures`` must have images."""
     open: Callable[[Place], Reader]
     pictures: tuple[str, ...] = ()
-    """Folders of images in that of a sequence, of one camera each; the first that there is counts,
-    unless another is given."""
+    """Folders of images in a sequence, of one camera each; the first that exists is used, unless
+    another is given."""
     signs: tuple[str, ...] = ()
-    """Patterns of files beside the images by which the data set is known without these."""
+    """Patterns of files that identify the data set where the images are missing."""
     needs: str = ""
-    """What is missing where there are only these signs, in words."""
+    """Missing part where only ``signs`` are found, for messages."""
     posed: Callable[[Place], PosedSet] | None = None
     """Reads the images with their true poses; raises InputError where these are missing."""
 
@@ -41,7 +41,7 @@ class Layout:
         return bool(self.is_like(folder))
 
     def place_in(self, folder: Path) -> Place | None:
-        """The sequence that a folder is, or of which it is a folder of images; none if neither."""
+        """The sequence of a folder, which may be one of its folders of images; none if neither."""
         if self.holds(folder):
             found = (folder / name for name in self.pictures)
             return Place(folder, next((p for p in found if has_images(p)), folder))
@@ -57,7 +57,7 @@ class Layout:
 
 
 def found_in(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
-    """The first layout of a folder as it is given, or of a sequence that it is a part of."""
+    """The first layout that fits a folder, or the sequence that the folder is part of."""
     for layout in layouts:
         if place := layout.place_in(folder):
             return layout, place
@@ -84,7 +84,7 @@ def found_below(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place]
 
 
 def what_is_missing(folder: Path, layouts: Sequence[Layout]) -> str | None:
-    """A sentence on what a folder lacks that resembles a layout; none where it resembles none."""
+    """A sentence on the missing part of a folder that resembles a layout; none if none does."""
     for layout in layouts:
         for sign in layout.signs:
             found = next(iter(folder.glob(sign)), None)
@@ -103,7 +103,7 @@ def _whole(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | No
 
 
 def _folders(folder: Path) -> Iterator[Path]:
-    """Folders in a folder, in order of names; what may not be looked into has none."""
+    """Folders in a folder, in order of names; none where access is denied."""
     try:
         yield from sorted(p for p in folder.iterdir() if p.is_dir() and p.name[0] != ".")
     except OSError:

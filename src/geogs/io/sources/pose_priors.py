@@ -1,4 +1,4 @@
-"""Poses of another tracker beside the images: which a source has, and which it uses."""
+"""Pose priors: poses of another tracker beside the images, and the choice of those to use."""
 
 import math
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from geogs.io.sources.reader import RecordingInfo
 from geogs.types import MeasuredPose, Trajectory
 
 LONGEST_GAP = 0.25
-"""Seconds between two poses beyond which none is interpolated between them."""
+"""Longest gap between two poses for interpolation, in seconds."""
 NEAR = 0.02
-"""Seconds before the first and after the last pose within which that is taken."""
+"""Longest time before the first and after the last pose at which that is used, in seconds."""
 KEYWORDS = ("none", "auto", "prior")
-"""Values of ``input.poses`` beside a file."""
+"""Values of ``input.poses`` other than a file."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class TimedPoses:
     trajectory: Trajectory
 
     def at(self, seconds: float) -> MeasuredPose | None:
-        """The pose at a time, interpolated between the two around; none where they are far."""
+        """The pose at a time, interpolated between its two neighbours; none if they are far."""
         times, T_wc = self.trajectory.timestamps, self.trajectory.T_wc
         after = int(np.searchsorted(times, seconds))
         if after == 0 or after == len(times):
@@ -48,7 +48,7 @@ class TimedPoses:
 
 
 def measured_pose(T_wc: Float64[np.ndarray, "4 4"]) -> MeasuredPose:
-    """A pose from camera to world, OpenCV axes, metres."""
+    """Make a measured pose from camera to world, OpenCV axes, metres."""
     return MeasuredPose(se3_inverse(torch.from_numpy(np.ascontiguousarray(T_wc))))
 
 
@@ -79,21 +79,21 @@ def turned_upright(
 
 @dataclass(frozen=True)
 class ChosenPoses:
-    """The poses beside the images that a source uses."""
+    """The pose priors that a source uses."""
 
     is_used: bool = False
     file: TimedPoses | None = None
     """Poses in place of the reader's."""
 
     def of(self, seconds: float, own: MeasuredPose | None) -> MeasuredPose | None:
-        """The pose of an image that the reader has one of, or none."""
+        """The pose of an image: the file's, or its ``own`` from the reader, or none."""
         if not self.is_used:
             return None
         return own if self.file is None else self.file.at(seconds)
 
 
 def chosen_poses(asked: str, info: RecordingInfo) -> ChosenPoses:
-    """The poses that ``input.poses`` asks for.
+    """The pose priors that ``input.poses`` selects.
 
     Raises:
         InputError: there are none, or the file cannot be read.

@@ -1,4 +1,4 @@
-"""Readers, which formats supply, of images as stored; reading ahead or in several threads."""
+"""Readers of stored images, one for each format; reading ahead or in several threads."""
 
 import hashlib
 import stat
@@ -19,7 +19,7 @@ from geogs.types import MeasuredDepth, MeasuredPose, SeenRows
 S = TypeVar("S")
 T = TypeVar("T")
 READERS = 4
-"""Threads that read what may be read in any order."""
+"""Number of threads for reads in any order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,19 +33,19 @@ class RawFrame:
     image: UInt8[np.ndarray, "h w 3"] | None
     """RGB; none where it could not be read."""
     is_damaged: bool = False
-    """Whether its decoder found that a part is wrong."""
+    """Whether its decoder found a damaged part."""
     why_not: str = "cannot be read"
-    """Fault where there is no image."""
+    """Reason why there is no image, as a clause."""
     depth: MeasuredDepth | None = None
-    """Depth of a sensor at that time, as stored or of the pixels of a working image."""
+    """Sensor depth at that time, as stored or at the pixels of a working image."""
     pose: MeasuredPose | None = None
     """Pose of the upright image, by another tracker."""
     name: str = ""
-    """Name of its file, or number of the frame, by which its mask is found."""
+    """Name of its file, or number of the frame, used to find its mask."""
     rows: SeenRows | None = None
     """Rectification of the rows of a working image; none for a global shutter."""
     mask: Bool[np.ndarray, "h w"] | None = None
-    """Pixels of a working image that may show the scene, by its own mask; none where all do."""
+    """Valid pixels of a working image, by its own mask; none where all are valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,25 +62,25 @@ class RecordingInfo:
     fps: float
     """Frames per second, nominal."""
     length: int | None = None
-    """Images in it; none where only reading to the end would tell."""
+    """Number of images; none where it is not known before reading to the end."""
     calibration: Calibration | None = None
     """The camera, if the data set describes it."""
     quarter_turns: int = 0
     """Clockwise quarter turns from the stored to the upright images."""
     depths: int = 0
-    """Images with the depth of a sensor that can be read."""
+    """Number of images with readable sensor depth."""
     depth_fault: str = ""
-    """Why there is none though files speak of it, as a clause."""
+    """Reason why listed depth cannot be used, as a clause."""
     has_poses: bool = False
-    """Whether poses, which are no truth, come with the images."""
+    """Whether poses come with the images that are not ground truth."""
     is_capture: bool = False
-    """Whether an app plainly tracked its camera, in metres."""
+    """Whether the poses are a capture app's tracking, in metres."""
     seconds: float | None = None
-    """Time of its last image, about; none where it is not known."""
+    """Approximate time of its last image; none where it is not known."""
 
     @property
     def has_depth(self) -> bool:
-        """Whether any images come with the depth of a sensor that can be read."""
+        """Whether any image has readable sensor depth."""
         return self.depths > 0
 
 
@@ -102,10 +102,10 @@ class Reader(Protocol):
 
 @runtime_checkable
 class SpreadReader(Protocol):
-    """A reader that gives images from all over without reading those between."""
+    """A reader with random access: it skips the images between."""
 
     def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
-        """An image at each of these places or, of a video, shortly before it."""
+        """Read an image at each of these indices or, of a video, shortly before it."""
         ...
 
 
@@ -121,13 +121,13 @@ def of_one_size(raw: RawFrame, info: RecordingInfo) -> RawFrame:
 
 
 def median_rate(steps: Float64[np.ndarray, "n"]) -> float:
-    """Images a second by the seconds from each to the next; nominal where none is above 0."""
+    """Median frame rate of time steps in seconds; nominal where no step is above 0."""
     steps = steps[steps > 0]
     return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
 
 
 def read_ahead(items: Iterator[T]) -> Iterator[T]:
-    """Yield the items of a generator, the next one being made meanwhile in a thread."""
+    """Yield the items of a generator; a thread makes the next one meanwhile."""
     end = object()
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as thread:
         pending = thread.submit(next, items, end)
@@ -142,13 +142,13 @@ def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T
 
 
 def fingerprint_of(paths: Sequence[Path]) -> str:
-    """Sixteen digits that change with the names and sizes of files."""
+    """Sixteen digits that depend on the names and sizes of files."""
     sizes = [(p.name, -1 if (size := size_of(p)) is None else size) for p in paths]
     return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
 
 
 def size_of(path: Path) -> int | None:
-    """Bytes of a file, asked for once, as folders may be far away; none where there is none."""
+    """Size of a file in bytes, by one call, as folders may be remote; none if it is missing."""
     try:
         found = path.stat()
     except OSError:

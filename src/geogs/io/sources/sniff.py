@@ -1,4 +1,4 @@
-"""Open whatever the user points at."""
+"""Open a source of any format, which is detected by content."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ from geogs.io.sources.reader import Reader
 from geogs.io.sources.ros.bag import Bag, is_bag
 from geogs.io.sources.working_images import WorkingImages
 
-# Data sets with an own description often carry one of these besides.
+# Data sets with their own description often have one of these as well.
 _POSED_FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
     (dtu.is_dtu, dtu.open_dtu),
     (nerfstudio.find_transforms, nerfstudio.open_nerfstudio),
@@ -46,10 +46,10 @@ def open_source(
     of the sequence, of its images, or one that holds no other sequence. Ground truth that lies
     beside the images is not read.
     ``camera:0``, an URL such as ``rtsp://…``, ``-`` (raw frames from standard input) and
-    ``play:FILE`` (a file at its pace) do not wait: of their frames the newest is given each time.
+    ``play:FILE`` (a file in real time) are live: each read gives the newest frame.
 
     Args:
-        path: the file or folder; several of one place, by one camera, become one stream.
+        path: the file or folder; several of one scene, by one camera, become one stream.
         config: selection of frames, intrinsics and working resolution; the defaults if none.
 
     Raises:
@@ -128,7 +128,7 @@ def open_posed_source(
     Args:
         path: the folder, or the file with the poses.
         config: selection of images, intrinsics and working resolution; the defaults if none.
-        hold_out: every so many-th of the selected images is left out; none leaves out none.
+        hold_out: every ``hold_out``-th of the selected images is left out; none keeps all.
 
     Raises:
         InputError: no images with poses are there, or they cannot be used.
@@ -165,8 +165,8 @@ def _posed_set(path: Path) -> PosedSet:
 
 
 def _timed_as_read(posed: PosedSet, folder: Path) -> PosedSet:
-    """The images with the times that they have without their poses, so that a trajectory of
-    ``geogs run`` is compared with the right ones where some images have no pose."""
+    """Give the images the times that they have when read without poses, so that a trajectory of
+    ``geogs run`` is matched to the right ones where some images have no pose."""
     for place in (folder, posed.files[0].path.parent) if posed.files else ():
         try:
             images = _folder_reader(place, wants_poses=False)

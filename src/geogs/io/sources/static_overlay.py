@@ -1,4 +1,4 @@
-"""Static overlays: what all images of a video show at the same place, while all else moves.
+"""Static overlays: image regions that do not change in a video while all else moves.
 
 A time stamp, a logo, a car's bonnet or the arm of a robot suggest that the camera stands still.
 Where no mask was given, they are found and masked out.
@@ -11,46 +11,46 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 IMAGES = 16
-"""Images that are compared, from all over a video."""
+"""Number of compared images, spread over a video."""
 LEAST_FRAMES = 40
-"""Shortest video that is searched: in about a second a camera hardly moves, and what it turns about
-stands still."""
+"""Shortest video that is searched, in frames: in about a second a camera hardly moves, and what it
+rotates about stands still."""
 _LEAST_IMAGES = 8
 _AGREEMENT = 0.9
-"""Part of the images in which a place has to look the same: of a glitch nothing follows."""
+"""Fraction of images in which a pixel must look the same, so that a glitch has no effect."""
 _BLUR = 1.0
-"""Pixels, against noise and the blocks of a codec."""
+"""Standard deviation of the blur in pixels, against noise and codec blocks."""
 _TEXTURE = 4.0
-"""Grey levels a pixel from which on a gradient would show that something moves."""
+"""Least gradient, in grey levels a pixel, that would show a motion."""
 _MOTION = 0.15
-"""Pixels that what stands still may seem to move."""
+"""Largest apparent motion of a static pixel, in pixels."""
 _NOISE = 1.5
-"""Grey levels that it may change by besides."""
+"""Largest additional change of a static pixel, in grey levels."""
 _CHANGE = 12.0
-"""Grey levels by which a pixel changes that plainly shows other things in other images."""
+"""Change of a pixel, in grey levels, that shows that its content moves."""
 _LEAST_MOVING = 0.4
-"""Part of the pixels that have to: else the camera rests or hardly moves, and what is far away
-stands still as well."""
+"""Least fraction of such pixels: with fewer the camera rests or hardly moves, and distant points
+stand still as well."""
 _GAP = 0.02
-"""Distance between still gradients up to which all between them is still, of the longer side."""
+"""Largest gap between still gradients that is filled, relative to the longer side."""
 _DENSE = 0.08
-"""Part of the pixels around that have a still gradient, where one counts."""
+"""Least fraction of neighbours with a still gradient, for a still gradient to count."""
 _LEAST_AREA, _LEAST_GRADIENTS = 0.002, 0.001
 """Least area of a static part and of its gradients, as fractions of the image."""
 _LEAST_RATIO = 0.05
-"""Part of the pixels of what looks the same in all images that still gradients have to be: a sky
-does, too, wherever the camera is."""
+"""Least fraction of still gradients in an unchanged region: a sky looks the same, too, wherever the
+camera is."""
 
 
 def static_overlay(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"] | None:
-    """Mask of what all images show at the same place while the camera moves; none if nothing.
+    """Mask of the pixels that stay the same while the camera moves; none if there are none.
 
     A pixel with a gradient is static where nine of ten images differ from their median by no more
-    than a shift of ``_MOTION`` would do. A bare pixel may look the same wherever the camera is, and
-    counts only beside such gradients.
+    than a shift of ``_MOTION`` would do. A textureless pixel may look the same wherever the
+    camera is, and counts only beside such gradients.
 
     Args:
-        images: grey, upright and of one size, from all over a video.
+        images: grey, upright and of one size, spread over a video.
     """
     if len(images) < _LEAST_IMAGES:
         return None
@@ -68,7 +68,7 @@ def static_overlay(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarra
 
 
 def _slope(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Length of the gradient, a pixel."""
+    """Length of the gradient per pixel."""
     across, down = (cv2.Sobel(image, cv2.CV_32F, x, 1 - x, scale=1 / 8) for x in (1, 0))
     return np.hypot(across, down)
 
@@ -76,8 +76,8 @@ def _slope(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
 def _parts(
     same: Bool[np.ndarray, "h w"], still: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """The parts of an image with many still gradients, without gaps and without specks; what looks
-    the same beside these belongs to them, but where it has hardly any of its own."""
+    """Regions of an image with many still gradients, without gaps and specks, and unchanged regions
+    that have at least some still gradients."""
     reach = max(2, round(_GAP * max(still.shape)))
     side = (2 * reach + 1, 2 * reach + 1)
     around = cv2.boxFilter(still.astype(np.float32), -1, side, borderType=cv2.BORDER_REFLECT)

@@ -1,4 +1,4 @@
-"""Files of true poses, whichever data set they are of."""
+"""Ground-truth pose files of any data set."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ _FILES: tuple[tuple[Callable[[Path], bool], Callable[[Path], Trajectory]], ...] 
     (arkitscenes.is_arkitscenes_truth, arkitscenes.read_arkitscenes_truth),
     (icl_nuim.is_icl_truth, icl_nuim.read_icl_truth),
 )
-"""Files that need more than their rows: axes, times, or the pose of the camera in a body."""
+"""Formats that need more than their rows: axes, times, or the pose of the camera in a body."""
 
 
 def read_truth(path: Path) -> Trajectory:

@@ -26,7 +26,7 @@ FISHEYE_VIEW = 90.0
 def resized_to(
     size: tuple[int, int], image: UInt8[np.ndarray, "h w *c"]
 ) -> UInt8[np.ndarray, "h2 w2 *c"]:
-    """An image at a width and height; itself where it has these."""
+    """Resize an image to a width and height; unchanged where it has these."""
     if image.shape[1::-1] == size:
         return image
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -36,7 +36,7 @@ def mask_as_image(
     way: Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h2 w2 3"]],
     mask: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """A mask that goes the way of an image."""
+    """Resample a mask like an image."""
     grey = np.where(mask, np.uint8(255), np.uint8(0))
     return way(np.repeat(grey[..., None], 3, 2))[..., 0] > 127
 
@@ -45,7 +45,7 @@ class Rectifier:
     """Makes working images: longer side at most ``long_edge`` pixels, straight lines straight.
 
     The focal length is enlarged just enough that no pixel looks outside the source image, so
-    there are no black borders, or such that the image has the field of view that is asked for;
+    there are no black borders, or such that the image has the requested field of view;
     ``camera`` is the exact pinhole of the result.
     """
 
@@ -56,10 +56,10 @@ class Rectifier:
         field_of_view: FieldOfView = "auto",
         focal: float | None = None,
     ) -> None:
-        """``focal`` of the working image instead of a field of view: what the lens did not see has
-        the colour of the border.
+        """``focal`` of the working image instead of a field of view: pixels that the lens did not
+        see get the colour of the border.
 
-        Raises InputError if the lens folds the image, or does not see so much.
+        Raises InputError if the lens folds the image, or its view is too narrow.
         """
         source = calibration.camera()
         distortion = calibration.distortion if calibration.is_distorted else ()
@@ -93,7 +93,7 @@ class Rectifier:
         return self.straightened(self.resized(image))
 
     def rolling_camera(self, lines: int, quarter_turns: int) -> RollingCamera:
-        """The camera of resized images whose sensor has so many lines and was turned so often."""
+        """The camera of resized images, for a sensor of ``lines`` and ``quarter_turns``."""
         return RollingCamera(
             self.resized_camera, self._distortion, quarter_turns, lines, lens=self._lens
         )
@@ -107,8 +107,8 @@ class Rectifier:
     ) -> UInt8[np.ndarray, "h w 3"]:
         """The working image of a resized image.
 
-        ``offsets`` say where in the resized image, relative to where the lens alone puts it, each
-        pixel of the working image was seen; what was outside gets the colour of the border.
+        ``offsets`` are added to the position in the resized image, by the lens alone, of each
+        pixel of the working image; pixels from outside get the colour of the border.
         """
         maps = self._maps if offsets is None else self.source_pixels(offsets)
         if maps is not None:
@@ -124,7 +124,7 @@ class Rectifier:
 
     @functools.cached_property
     def _pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places of the pixels without distortion."""
+        """Pixel coordinates without distortion."""
         v, u = np.mgrid[: self.size[1], : self.size[0]].astype(np.float32)
         return u, v
 
@@ -138,7 +138,7 @@ class _Bending:
     lens: LensModel
 
     def sees(self, zoom: float) -> bool:
-        """Whether the border of the zoomed image lies in the source, and before any fold."""
+        """Whether the border of the zoomed image lies in the source, inside any fold."""
         source = self.source
         rays = _border_rays(_zoomed(source, zoom))
         pixels, inner = self._pixels(rays), self._pixels(0.99 * rays)
@@ -148,7 +148,7 @@ class _Bending:
         return bool(grows.all() and inside.all())
 
     def least_zoom(self, least: float = 0.05) -> float:
-        """The smallest factor of at least ``least`` on the focal length that shows no outside.
+        """The smallest factor, at least ``least``, on the focal length without black borders.
 
         To 1e-4. Raises InputError where the lens folds the image.
         """
@@ -174,7 +174,7 @@ class _Bending:
 
 
 def _zoom_to(degrees: float, bends: _Bending) -> float:
-    """The factor for a field of view. Raises InputError if the lens does not see so much."""
+    """The factor for a field of view. Raises InputError if the lens sees less."""
     source = bends.source
     zoom = _zoom_for(degrees, source)
     if not bends.sees(zoom) and zoom < (least := bends.least_zoom()):
@@ -187,7 +187,7 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
 
 
 def _zoom_for(degrees: float, camera: Camera) -> float:
-    """The factor on the focal length by which so much is seen along the longer side."""
+    """The factor on the focal length for a field of view along the longer side."""
     return camera.with_field_of_view(degrees).fx / camera.fx
 
 

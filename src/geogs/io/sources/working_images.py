@@ -1,7 +1,7 @@
-"""Working images of one recording, in order, with their times and the camera that took them.
+"""Working images of one recording, in order, with their times and their camera.
 
-A format supplies a reader (how images are stored); :class:`WorkingImages` adds what all have in
-common: the selection, the calibration, the shutter, the working resolution and reading ahead.
+A format supplies a reader of stored images; :class:`WorkingImages` adds the common parts: the
+selection, the calibration, the shutter, the working resolution and reading ahead.
 """
 
 from collections.abc import Iterator
@@ -39,9 +39,9 @@ from geogs.threads import Each
 from geogs.types import MeasuredDepth, SeenRows
 
 LEAST_EDGE = 12
-"""Pixels of the shorter side of a working image."""
+"""Least shorter side of a working image in pixels."""
 MOST_OF = 0.97
-"""Fraction of the announced length below which a recording is called cut off."""
+"""Fraction of the announced length below which a recording is reported as cut off."""
 
 
 class WorkingImages:
@@ -61,9 +61,8 @@ class WorkingImages:
     ) -> None:
         """``calibration`` of the upright images, instead of the reader's.
 
-        ``shutter``, instead of the settings'; ``focal`` of the working images, instead of what the
-        settings ask for; ``overlay``, true where all images at working size show a static
-        overlay.
+        ``shutter``, instead of the settings'; ``focal`` of the working images, instead of the
+        settings'; ``overlay``, true where all images at working size show a static overlay.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -74,7 +73,7 @@ class WorkingImages:
                 f"{why}; leave out --depth, or give that of the images."
             )
         self.poses = chosen_poses(config.poses, info)
-        """Poses of another tracker beside the images."""
+        """Pose priors beside the images."""
         self.reader = reader
         """Reads the stored images."""
         self.name = info.name
@@ -97,26 +96,26 @@ class WorkingImages:
         masks = None if config.mask is None else expanded(config.mask)
         self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
         self.mask: Bool[np.ndarray, "h w"] | None = None
-        """Pixels of every frame that may show the scene; none where all do."""
+        """Valid pixels of every frame; none where all are valid."""
         if masks is not None and self._masks is None:
             self.mask = self._straight(read_mask(masks, (info.height, info.width)))
         elif overlay is not None:
             self.mask = self._straight(~overlay)
         self._overlay = overlay
         self.black_is_masked = self._masks is not None
-        """Whether pixels of frames that are quite black are masked out."""
+        """Whether black pixels of frames are masked out."""
         self.is_live = isinstance(reader, LiveReader)
-        """Whether frames come at their own pace."""
+        """Whether the source is live."""
         self.uses_depth = config.depth != "none" and info.has_depth
-        """Whether images come with the depth that a sensor measured."""
+        """Whether images have sensor depth."""
 
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
-        """A mask of an image as stored, or at working size, undistorted as images are."""
+        """Undistort a mask of an image as stored, or at working size, like an image."""
         return mask_as_image(self._rectifier, mask)
 
     @property
     def depth_found(self) -> str:
-        """A sentence on the depth of a sensor."""
+        """A sentence on the sensor depth."""
         info = self.reader.info
         if info.has_depth:
             of = "" if info.length is None else f" of {info.length}"
@@ -126,7 +125,7 @@ class WorkingImages:
 
     @property
     def is_calibration_open(self) -> bool:
-        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        """Whether the focal length is a guess or nominal, not given by user or data set."""
         asked = self._config.intrinsics.strip().lower() == "auto"
         return asked and (self.calibration.is_guess or self.calibration.is_nominal)
 
@@ -137,8 +136,8 @@ class WorkingImages:
         focal: float | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
     ) -> "WorkingImages":
-        """The same images, undistorted by another calibration, rectified by another readout, as a
-        pinhole of another focal length sees them, or with a static overlay masked out."""
+        """The same images with another calibration, another readout, another focal length of the
+        working camera, or a static overlay masked out."""
         info = self.reader.info
         known = calibration.fit(info.width, info.height) if calibration else self.calibration
         return WorkingImages(
@@ -147,15 +146,15 @@ class WorkingImages:
         )  # fmt: skip
 
     def as_recorded(self) -> "WorkingImages":
-        """All images of the selection, whatever the stride, with their rows as they came."""
+        """All images of the selection at stride 1, without row rectification."""
         config = replace(self._config, stride=1)
         return WorkingImages(
             self.reader, config, self.calibration, Shutter(), self._focal, self._overlay
         )
 
     def spread(self, count: int) -> Iterator[RawFrame]:
-        """So many images from all over the selection, at working size, lens and rows as stored;
-        fewer, or none, where the recording can only be read from its beginning."""
+        """Read ``count`` images spread over the selection, at working size, lens and rows as
+        stored; fewer, or none, where the recording can only be read from its beginning."""
         config, length = self._config, self.reader.info.length
         if length is None and self.reader.info.seconds is not None:
             length = round(self.reader.info.seconds * self.reader.info.fps)
@@ -192,7 +191,7 @@ class WorkingImages:
 
     @property
     def length(self) -> int | None:
-        """Images to expect, unreadable ones included; none where it is not known beforehand."""
+        """Expected number of images, unreadable ones included; none where not known beforehand."""
         config, length = self._config, self.reader.info.length
         if length is None:
             return None
@@ -220,7 +219,7 @@ class WorkingImages:
             yield raw
 
     def _open_rows(self) -> SeenRows | None:
-        """Possible times of rows of any image; none where the shutter is known to be global.
+        """Row times of any image by the readout's error; none for a known global shutter.
 
         It is the same for all images and kept once.
         """
@@ -233,7 +232,7 @@ class WorkingImages:
         return replace(seen, is_rectified=False)
 
     def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
-        """Working images with what masks of their own leave out black."""
+        """Working images with masked-out pixels black, by their own masks."""
         for raw in working:
             if self._masks is None or raw.image is None:
                 yield raw
@@ -245,13 +244,13 @@ class WorkingImages:
     def _rectified(
         self, depth: MeasuredDepth | None, moved: Float[np.ndarray, "h w 2"] | None = None
     ) -> MeasuredDepth | None:
-        """Stored depth for the pixels of a working image, whose rows were ``moved``."""
+        """Stored depth for the pixels of a working image; ``moved`` are its row offsets."""
         if not (self.uses_depth and isinstance(depth, RecordedDepth)):
             return None
         return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
 
     def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
-        """Working images of a rolling shutter, from a place in the source on.
+        """Working images of a rolling shutter, from an index of the source on.
 
         Rotation is measured between neighbours in the source, whatever the stride, and the
         image before the first is read, too.
@@ -282,11 +281,11 @@ class WorkingImages:
         yield from each(straight, with_angular_motion(images, rolling, readout, is_selected, each))
 
     def why_short(self, read: int, last: float) -> str:
-        """Message where fewer images came than the recording announces; empty where all did.
+        """Message if fewer images came than the recording announces; empty if all came.
 
         Args:
-            read: images of the selection, those that cannot be used included.
-            last: time of the last of them, seconds.
+            read: number of images of the selection, unusable ones included.
+            last: time of the last one, seconds.
         """
         seconds = None if self._config.stop is not None else self.reader.info.seconds
         if self.length is not None and read < MOST_OF * self.length - 1:
@@ -298,7 +297,7 @@ class WorkingImages:
         return f"{self.name} {missing}; is it cut off?"
 
     def why_empty(self, skipped: int) -> str:
-        """Message where there is no image but those that were skipped."""
+        """Message where all images were skipped, or there are none."""
         if skipped:
             return f"{self.name}: none of its {skipped} images can be used."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."
@@ -312,7 +311,7 @@ def _check_selection(config: InputConfig, length: int | None) -> None:
 
 
 def check_large_enough(camera: Camera, name: str) -> None:
-    """Raises InputError where working images have too few pixels on a side to track anything."""
+    """Raise InputError where working images are too small for tracking."""
     if min(camera.width, camera.height) < LEAST_EDGE:
         raise InputError(
             f"{name} gives working images of {camera.width}x{camera.height} pixels; both sides "

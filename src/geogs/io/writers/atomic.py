@@ -1,4 +1,4 @@
-"""Files appear complete or not at all: written beside their place, then renamed."""
+"""Atomic files: written under a temporary name in the same folder, then renamed."""
 
 import errno
 import os
@@ -24,7 +24,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     one is gone.
 
     Raises:
-        OutputError: the disk is full, or the place cannot be written.
+        OutputError: the disk is full, or the folder cannot be written.
     """
     path = Path(path)
     # Others may write the same file at the same time, also from another machine.
@@ -50,9 +50,9 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def prepare_output_folder(path: str | Path) -> Path:
-    """Make the folder for results and try that files can be written there.
+    """Make the folder for results and test that files can be written there.
 
-    Meant for the beginning of a run, so that hours of work do not end at a read-only disk.
+    Called at the beginning of a run, so that hours of work do not end at a read-only disk.
 
     Raises:
         OutputError: it is a file, or cannot be made or written.

@@ -1,4 +1,4 @@
-"""A folder held open: what is done in it by name stays in it, as no link in it is followed."""
+"""A folder held open: operations by name stay inside it, as no link in it is followed."""
 
 import errno
 import hashlib
@@ -17,8 +17,8 @@ _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
 class Directory:
     """A folder, by its handle.
 
-    Names have ``/`` between folders. Whatever a name leads through has to be a folder in the one
-    before, and what it names is taken as it is: a link is moved or deleted itself.
+    Names have ``/`` between folders. Each part but the last must be a folder in the one before, and
+    the last is not followed: a link is moved or deleted itself.
 
     Every method raises OSError, also for a name that leads elsewhere.
     """
@@ -30,7 +30,7 @@ class Directory:
     @staticmethod
     @contextmanager
     def opened(path: Path) -> Iterator["Directory"]:
-        """The folder of a path that the user gave: links may lead to it, but not on from it."""
+        """Open the folder of a path: links may lead to it, but not on from it."""
         handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:
             yield Directory(path, handle)
@@ -77,7 +77,7 @@ class Directory:
             return parent._status(last).st_ino
 
     def read(self, name: str, largest: int) -> bytes:
-        """The beginning of a plain file, up to so many bytes."""
+        """The beginning of a plain file, up to ``largest`` bytes."""
         with self._file(name) as file:
             return file.read(largest)
 
@@ -87,7 +87,7 @@ class Directory:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def make(self, name: str) -> bool:
-        """Make a folder; whether there was none."""
+        """Make a folder. Returns whether there was none."""
         with self._parent(name) as (parent, last):
             if parent.is_folder(last):
                 return False
@@ -99,7 +99,7 @@ class Directory:
             return True
 
     def move(self, name: str, target: "Directory", new_name: str) -> None:
-        """Move an entry to a name in another folder, in place of what had that."""
+        """Move an entry to a name in another folder; an entry of that name is replaced."""
         with self._parent(name) as (here, old), target._parent(new_name) as (there, new):
             os.replace(old, new, src_dir_fd=here._handle, dst_dir_fd=there._handle)
 
@@ -118,7 +118,7 @@ class Directory:
             os.rmdir(last, dir_fd=parent._handle)
 
     def delete_all(self, name: str) -> None:
-        """Delete a folder with all that is in it, as far as possible."""
+        """Delete a folder with its content, as far as possible."""
         with self._parent(name) as (parent, last):
             shutil.rmtree(last, ignore_errors=True, dir_fd=parent._handle)
 
@@ -132,7 +132,7 @@ class Directory:
 
     @contextmanager
     def _parent(self, name: str) -> Iterator[tuple["Directory", str]]:
-        """The folder in which the last part of a name lies, and that part."""
+        """The folder of the last part of a name, and that part."""
         first, _, rest = name.partition("/")
         if not first or first == ".." or "\0" in name or (first == "." and rest):
             raise FileNotFoundError(f"{name!r} is no name of what is in a folder")

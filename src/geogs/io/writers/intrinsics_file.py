@@ -24,8 +24,8 @@ def write_intrinsics(
     """Write the pinhole of the frames, and the calibration and the shutter of the stored images.
 
     The readout, by which rows were rectified, is in seconds; all else is in pixels with the centre
-    of the first pixel at (0, 0). Given as ``intrinsics``, the file stands for the calibration of
-    the source where it has one.
+    of the first pixel at (0, 0). Given as ``intrinsics``, the file means the calibration of the
+    source where it has one.
     """
     document: dict[str, object] = {
         "model": "PINHOLE",

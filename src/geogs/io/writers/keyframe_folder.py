@@ -1,5 +1,5 @@
-"""``keyframes/``: the images of keyframes as they were used, their masks, and where and when a
-rolling shutter saw what they show."""
+"""``keyframes/``: the working images of keyframes, their masks, and the position and time of each
+pixel in a rolling-shutter image."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -84,7 +84,7 @@ def write_rows(path: Path, rows: Mapping[int, SeenRows]) -> None:
 
 
 def read_rows(path: Path) -> dict[int, SeenRows]:
-    """Read what ``write_rows`` wrote; nothing where there is no file.
+    """Read the rows of keyframes; empty where there is no file.
 
     Raises:
         InputError: the file is damaged.

@@ -1,4 +1,4 @@
-"""``map.safetensors``: the disks, ten numbers each, and the views that they were seen from."""
+"""``map.safetensors``: the disks, ten numbers each, and the views of the map."""
 
 import json
 from collections.abc import Mapping
@@ -23,11 +23,11 @@ from geogs.short_repr import ShortRepr
 from geogs.types import MapSnapshot
 
 FORMAT_VERSION = 2
-"""Raised when older programs could not read the file any more; the first has all in the world."""
+"""Incremented where older programs cannot read the file; version 1 is all in the world frame."""
 
 _SHAPES = {"position": (3,), "quaternion": (4,), "scale": (2,), "opacity": ()}
 _OWN = {"position": "map_position", "scale": "map_scale"}
-"""Names of what is in the map's own frame, where that is not the world's."""
+"""Names of tensors in the map's own frame, where that is not the world's."""
 _NONE = torch.zeros(0, 0, 0)
 
 
@@ -59,7 +59,7 @@ def _write(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
         "metadata": json.dumps(dict(metadata)),
     }
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # The library would write the metadata in an order of its own, another in every process.
+    # The library would write the metadata in an order that differs between processes.
     data = memoryview(save(on_cpu))
     end = 8 + int.from_bytes(data[:8], "little")
     table = {"__metadata__": header, **json.loads(bytes(data[8:end]))}
@@ -80,7 +80,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapsho
 
 
 def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFile:
-    """Read the disks of a map, in the world, and what lies beside them.
+    """Read the disks of a map, in the world, and the data beside them.
 
     Raises:
         InputError: as of ``load_map``.
@@ -143,18 +143,18 @@ def _open(path: str | Path) -> "safe_open":
 
 @dataclass(frozen=True, repr=False)
 class MapViews(ShortRepr):
-    """The keyframes for which depth maps are rendered, and all that these depend on."""
+    """The keyframes for which depth maps are rendered, with the rendering parameters."""
 
     camera: Camera
     """Camera of the keyframes' images."""
     render_camera: Camera
     """Camera of the depth maps."""
     min_alpha: float
-    """Opacity above which the map hides what lies behind."""
+    """Opacity above which the map occludes."""
     max_spread: float
-    """Relative difference of mean and median depth up to which a ray meets one surface."""
+    """Largest relative difference of mean and median depth for a ray that meets one surface."""
     plane_reach: float
-    """Relative distance up to which a depth is averaged over the planes of the pixels around."""
+    """Largest relative distance for averaging a depth over the planes of neighbouring pixels."""
     origin: Float64[np.ndarray, "3"]
     """World coordinates of the origin of the map's own frame."""
     unit: float
@@ -177,8 +177,8 @@ def save_map_with_views(
 ) -> None:
     """Write the disks, and the views beside them.
 
-    A map in a frame of its own has its positions and scales there, under names that say so: those
-    of the world, which have lost digits, are computed when it is read.
+    A map in a frame of its own has its positions and scales in that frame, under names of their
+    own; those of the world, which have lost digits, are computed when it is read.
     """
     tensors: dict[str, Tensor] = {
         "keyframe_id": torch.from_numpy(views.keyframe_id),
@@ -234,7 +234,7 @@ def _views(file: MapFile) -> MapViews:
         raise ValueError("its keyframes differ in number")
     origin, unit = _frame(said)
     spread = float(said["max_spread"])
-    # Before the reach had a number of its own it was twice the spread.
+    # Older files have no reach of their own: it was twice the spread.
     reach = float(said.get("plane_reach", 2 * spread))
     if not (holds((RIGID,), T_cw) and holds((), times) and holds((), reach)):
         raise ValueError("a pose is none, or a number is not finite")

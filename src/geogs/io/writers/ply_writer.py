@@ -1,7 +1,7 @@
 """PLY files: the coloured mesh, and the disks as splats for 3D Gaussian splatting viewers.
 
-Written by hand, as a library would be a dependency that writes other bytes and no splats: trimesh
-takes half as long again for a million faces and adds an alpha channel.
+Written by hand, as a library would be a dependency without splats: trimesh takes half as long again
+for a million faces and adds an alpha channel.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ SH_DEGREE_0 = 0.28209479177387814
 
 @dataclass(frozen=True)
 class _Element:
-    """A table of a PLY file: packed little-endian rows, and how the header describes a row."""
+    """A table of a PLY file: packed little-endian rows, and the header lines of a row."""
 
     name: str
     table: np.ndarray

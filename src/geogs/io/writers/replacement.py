@@ -1,11 +1,11 @@
-"""The files of a command take their places together, or none of them does.
+"""Replacement of all files of a command together, or of none.
 
 New files are written into a new folder beside the old ones, which has no links in it. Until the
 last of them is on the disk nothing else is touched; if the disk is full or the command ends before,
 that folder is deleted, and all is as it was. Then
 
-1. the folders that the files need are made, or are seen to be folders and no links,
-2. the new folder is renamed from ``.geogs.N.new`` to ``.geogs.N.ready``, by which it counts,
+1. the folders that the files need are made, or checked to be folders and no links,
+2. the new folder is renamed from ``.geogs.N.new`` to ``.geogs.N.ready``, which commits it,
 3. every file is renamed into its place, files of the previous result that the new one has no others
    for are deleted, and last the list of the result's files is renamed into its place.
 
@@ -18,9 +18,9 @@ ones. (A link to the folder of the current result would avoid that, but not all 
 and copies of the folder would be of the link.) Nothing of geogs reads such a mixture.
 
 The list ``.geogs.json`` says which files may be deleted: names and SHA-256 of the result's files.
-It may come from somebody else: names in it cannot lead out of the folder, and a file with other
-content stays. N in the names of new folders is their inode number, so that a folder that was copied
-from elsewhere is not taken for one of ours.
+It is not trusted: names in it cannot lead out of the folder, and a file with other
+content stays. N in the names of new folders is their inode number, so that a copied folder does not
+count as one of ours.
 """
 
 import json
@@ -41,26 +41,26 @@ LIST = ".geogs.json"
 """Name of the list of a result's files."""
 _NEW = re.compile(r"\.geogs\.(\d{1,20})\.(new|ready)")
 _MARKS = ("summary.json", "map.safetensors")
-"""Files of every result, by which one without a list is recognised."""
+"""Files of every result, which identify one without a list."""
 _FOLDERS = ("adjusted", "depth_fusion", "keyframes", "online", "report", "snapshots")
 """Folders that a result may need, checked before the work begins."""
 _LARGEST_LIST = 1 << 26
-"""Bytes; there are about a hundred for every file."""
+"""Largest list in bytes; it has about a hundred for every file."""
 
 Extent = Literal["result", "part", "beside"]
-"""A whole result, in place of the previous one; some files of the one that is there; or files that
-no later result replaces, such as exports."""
+"""A whole result, which replaces the previous one; some files of the existing one; or files that no
+later result replaces, such as exports."""
 
 
 @contextmanager
 def replaced(folder: Path, what: Extent) -> Iterator[Path]:
-    """Yield a folder for new files; they take their places when the block ends without an error.
+    """Yield a folder for new files; they move into place when the block ends without an error.
 
-    Nobody else may write there meanwhile. What is new has the name that it has in the new folder.
+    No other process may write there meanwhile. Files keep the names of the new folder.
 
     Raises:
         OutputError: something cannot be written, a link or something else is in the way, or a
-            result is to take the place of one that has no list of its files.
+            result would replace one that has no list of its files.
     """
     with _sentence(folder), Directory.opened(folder) as place:
         if what == "result":
@@ -71,7 +71,7 @@ def replaced(folder: Path, what: Extent) -> Iterator[Path]:
     except BaseException as error:
         with suppress(OSError), Directory.opened(folder) as place:
             place.delete_all(new)
-        if isinstance(error, OutputError):  # where it was to be, not where it lay meanwhile
+        if isinstance(error, OutputError):  # its final path, not the temporary one
             raise OutputError(str(error).replace(new + os.sep, "")) from error
         raise
     with _sentence(folder), Directory.opened(folder) as place:
@@ -79,14 +79,14 @@ def replaced(folder: Path, what: Extent) -> Iterator[Path]:
 
 
 def is_half_done(folder: Path) -> bool:
-    """Whether a command was cut off there while it put new files into their places."""
+    """Whether a command was interrupted there while it moved new files into place."""
     with suppress(OSError), Directory.opened(folder) as place:
         return any(name.endswith(".ready") for name in _ours(place))
     return False
 
 
 def recover(folder: Path) -> None:
-    """Complete or undo what a command left that was cut off; nobody else may write there meanwhile.
+    """Complete or undo an interrupted write; no other process may write there meanwhile.
 
     Raises:
         OutputError: that cannot be done.
@@ -100,7 +100,7 @@ def recover(folder: Path) -> None:
 
 
 def _check(place: Directory) -> None:
-    """Raise early what writing a whole result would raise at its end."""
+    """Raise the errors of writing a whole result early."""
     names, listed = place.names(), _listed(place)
     if any(mark in names and mark not in listed for mark in _MARKS):
         raise OutputError(
@@ -123,13 +123,13 @@ def _begun(place: Directory) -> str:
 
 
 def _ours(place: Directory) -> list[str]:
-    """Folders of new files that were made there."""
+    """Folders of new files in this folder, without copied ones."""
     found = [match for name in place.names() if (match := _NEW.fullmatch(name))]
     return [match[0] for match in found if place.number(match[0]) == int(match[1])]
 
 
 def _committed(place: Directory, new: str, what: Extent) -> str:
-    """The first and second step. Returns the name of the folder that counts from now on."""
+    """Do the first and second step. Returns the name of the committed folder."""
     made: list[str] = []
     try:
         with place.inner(new) as files:
@@ -157,7 +157,7 @@ def _committed(place: Directory, new: str, what: Extent) -> str:
 
 
 def _put_in_place(place: Directory, ready: str) -> None:
-    """The third step, or what is left of it."""
+    """Do the third step, or its rest."""
     try:
         _move_all(place, ready)
     except OSError as error:
@@ -172,13 +172,13 @@ def _move_all(place: Directory, ready: str) -> None:
         for folder in new.folders():
             place.make(folder)
         names = [name for name in new.files() if name != LIST]
-        # Whoever waits for a result waits for its summary.
+        # The summary comes last: other programs wait for it.
         for name in sorted(names, key=lambda name: name == "summary.json"):
             new.move(name, place, name)
         if LIST in new.names():
             listed = _listed(place)
             for name in listed.keys() - _listed(new).keys():
-                with suppress(OSError):  # not there, or not what geogs wrote
+                with suppress(OSError):  # missing, or not written by geogs
                     if place.sha256(name) == listed[name]:
                         place.delete(name)
             new.move(LIST, place, LIST)

@@ -1,4 +1,4 @@
-"""Trajectories as TUM, KITTI and EuRoC have them; all are camera to world in OpenCV axes."""
+"""Trajectories in the formats of TUM, KITTI and EuRoC; all are camera to world, OpenCV axes."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ _EUROC = (
 def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) -> None:
     """Write ``trajectory.tum`` and ``keyframes.tum`` of a result or one of its stages.
 
-    The first has the frames whose pose is known. Those of which no more than the orientation is
-    known go to ``orientations.tum``, at the position 0 0 0, where there are any.
+    The first has the frames whose pose is known. Frames with only a known orientation go to
+    ``orientations.tum``, at the position 0 0 0, where there are any.
     """
     write_tum_trajectory(folder / "trajectory.tum", frames.of("tracked"))
     turned = frames.of("orientation only")
@@ -43,7 +43,7 @@ def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Twelve numbers a row, the upper 3x4 of camera to world; seconds in ``times.txt`` beside it.
+    """Write twelve numbers a row, the upper 3x4 of camera to world; seconds in ``times.txt``.
 
     Rows follow each other in time; KITTI has no other mark of a frame.
     """
@@ -54,7 +54,7 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
-    """``data.csv`` of a ground truth: nanoseconds, position, quaternion w, x, y, z.
+    """Write a ground truth's ``data.csv``: nanoseconds, position, quaternion w, x, y, z.
 
     The body is the camera; velocities and biases are left out.
     """

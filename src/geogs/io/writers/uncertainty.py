@@ -15,7 +15,7 @@ HEADER = "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth
 def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertainty) -> None:
     """Write a row per frame: its state and standard deviations as of ``Uncertainty``.
 
-    The state is tracked, orientation only or lost. Between the frames of ``known`` deviations are
+    The state is tracked, orientation only or lost. Between the frames of ``known``, deviations are
     interpolated in time; a frame that is not tracked has none.
     """
     at = trajectory.timestamps
@@ -29,8 +29,8 @@ def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertain
 
 
 def moved_rows(path: Path, factor: float, shift: float = 0.0) -> list[str]:
-    """The rows of a table, without its header, in another unit of length and ``shift`` seconds
-    later; none where there is no table.
+    """Read the rows of a table, without header, scaled to another unit of length and ``shift``
+    seconds later; none where there is no table.
 
     Raises InputError if it is damaged.
     """
@@ -50,8 +50,8 @@ def moved_rows(path: Path, factor: float, shift: float = 0.0) -> list[str]:
 
 
 def read_states(path: Path) -> list[tuple[float, str, float]]:
-    """Time, state and standard deviation of the position (infinite where none is given) of every
-    frame, by the table of a run. Raises InputError if it is damaged."""
+    """Read time, state and standard deviation of the position (infinite where none is given) of
+    every frame from the table of a run. Raises InputError if it is damaged."""
     try:
         cells = [row.split(",") for row in read_text(path).splitlines()[1:]]
         return [(float(row[0]), row[1], float(row[2] or "inf")) for row in cells]

@@ -1,4 +1,4 @@
-"""The camera in the adjustment of all keyframes: rows, lens, and what each frame has of its own."""
+"""The camera in the global adjustment: rows, lens, and per-frame intrinsics."""
 
 from geogs.loop.camera.found import straight_views
 from geogs.loop.camera.frame_lenses import correct_frame_lenses
@@ -9,13 +9,13 @@ from geogs.loop.keyframe_matches import KeyframeMatches
 
 
 def adjust_camera(matches: KeyframeMatches, ends: bool) -> None:
-    """Match all keyframes, and find what the matches say of the camera.
+    """Match all keyframes, and estimate the camera from the matches.
 
-    Matches are those of images as they were tracked, and stay so: a camera that is found is that of
-    the grid from then on. Where that ``ends`` the tracking and something was found, what has moved
-    is matched again, everything is adjusted once more, and images are made straight for the map.
-    Where nobody said the focal length (``KeyframeTable.focal_deviation``) the first matches are at
-    half the resolution, and all are measured again.
+    Matches always belong to the images as tracked: an estimated camera becomes that of the grid.
+    Where this ``ends`` the tracking and a correction was found, pairs that have moved are matched
+    again, everything is adjusted once more, and images are straightened for the map. Where the
+    focal length was not given (``KeyframeTable.focal_deviation``) the first matches are at half the
+    resolution, and all are measured again.
     """
     table, fine = matches.keyframes.table, matches.tracker.config.fine_adjustment
     is_open = ends and table.focal_deviation > 0

@@ -1,4 +1,4 @@
-"""What matches say of the lens: that of all frames, and what frames have of their own."""
+"""Lens estimated from matches: shared lens and per-frame intrinsics."""
 
 import math
 from collections.abc import Mapping
@@ -14,20 +14,20 @@ from geogs.types import FoundLens, FrameLens
 
 @dataclass(frozen=True)
 class FrameLenses:
-    """What frames have of their own; true where they have something."""
+    """Per-frame intrinsics; true if they vary."""
 
     each: Mapping[int, FrameLens] = field(default_factory=dict)
-    """By the indices of the frames that have a place."""
+    """Intrinsics by the indices of the located frames."""
     prior: VaryingPrior | None = None
-    """By which they vary, where they do."""
+    """Prior of the variation; None if they do not vary."""
 
     def __bool__(self) -> bool:
         return self.prior is not None
 
 
 def found_lens(given: Camera, found: Camera, said: FoundLens | None = None) -> FoundLens:
-    """The lens of a camera that was found, of images that were taken for those of a pinhole; what
-    was ``said`` of its deviations before stays."""
+    """Return the lens of an estimated camera relative to the ``given`` pinhole; deviations are
+    those in ``said``."""
     focal, k1, k2, right, down = found.moves_from(given)
     said = said or FoundLens(0.0, 0.0, 0.0, 0.0)
     return replace(said, k1=k1, k2=k2, focal=math.exp(focal), right=right, down=down)
@@ -36,7 +36,7 @@ def found_lens(given: Camera, found: Camera, said: FoundLens | None = None) -> F
 def straight_views(
     given: Camera, found: Camera, said: FoundLens | None, own: FrameLenses
 ) -> FrameViews:
-    """How frames of a camera that was found are straightened."""
+    """Return the views that straighten the frames of an estimated camera."""
     each = torch.tensor([o.sizes for o in own.each.values()] or [FrameLens().sizes])
     focal, right, down = each.double().square().mean(0).sqrt().tolist()
     lens = found_lens(given, found, said)

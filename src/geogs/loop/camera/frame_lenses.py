@@ -1,10 +1,10 @@
 """Per-frame intrinsics in the adjustment of all keyframes: focusing, zooming, stabilised lenses.
 
-Focal length and principal point of each keyframe, beside those of the video, are estimated from all
-matches; the matches are corrected, and everything is adjusted again. The prior of what a keyframe
-has of its own is white noise, of the focal length and a random walk, whose variances are estimated
-as well (EM). Focal length and principal point are freed one after the other, where that lowers the
-cost by much (forward selection): a depth that is still wrong asks for either.
+Focal length and principal point of each keyframe, relative to the shared ones, are estimated from
+all matches; the matches are corrected, and everything is adjusted again. The prior of a keyframe's
+intrinsics is white noise, for the focal length plus a random walk, whose variances are estimated as
+well (EM). Focal length and principal point are freed one after the other, where that lowers the
+cost by much (forward selection): a depth that is still wrong would be explained by either.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,18 +33,18 @@ from geogs.world.edges import Edge, Pair
 from geogs.world.keyframes import Keyframe
 
 ROUNDS = 12
-"""At most."""
+"""Most rounds."""
 CONVERGED = 2e-4
 """Largest RMS step of a parameter over the keyframes at which the rounds end."""
 DIVERGED = 2e-3
-"""RMS step after the last round from which on nothing is accepted."""
+"""RMS step after the last round above which the estimate is rejected."""
 AMBIGUOUS = 0.02
-"""Relative cost that the parameters which stay fixed may remove in the end: 0.037 where the map was
-wrong from its start and varying intrinsics hid it, up to 0.009 where they were right
+"""Largest relative cost that the fixed parameters could still remove at the end: 0.037 where the
+map was wrong from its start and varying intrinsics hid it, up to 0.009 where they were right
 (docs/notebook/lens.md)."""
 AMBIGUOUS_ROWS = 0.06
-"""The same beside a rolling shutter, as a lens that moves while rows are read shears and stretches
-the image: 0.022 to 0.042. The verdict tests it again once that is corrected."""
+"""The same for a rolling shutter, as a lens that moves during readout shears and stretches the
+image: 0.022 to 0.042. The verdict tests it again once that is corrected."""
 GIVEN = 1e-6
 """Prior standard deviation of the shared intrinsics of a given lens."""
 
@@ -57,11 +57,10 @@ def correct_frame_lenses(
 ) -> FrameLenses:
     """Estimate per-frame intrinsics, correct all matches for them and adjust again.
 
-    Nothing, and everything as it was, where no parameter lowers the cost enough, the steps do not
-    converge, or a parameter that stays fixed would do nearly as well. What was found ``before`` is
-    where the steps begin, and stays where they lead to nothing. Matches of frames between the
-    keyframes are corrected, too. Not in the world of a saved map. The shared intrinsics of a given
-    lens stay.
+    The estimate is empty, and everything is restored, if no parameter lowers the cost enough, the
+    steps do not converge, or a fixed parameter would do nearly as well. Steps begin at the estimate
+    ``before``, which is kept in these cases. Matches of frames between the keyframes are corrected,
+    too. Not in the world of a saved map. The shared intrinsics of a given lens are fixed.
     """
     before = before or FrameLenses()
     ids = matches.tracker.segment.ids
@@ -90,7 +89,7 @@ def correct_frame_lenses(
 
 @dataclass(frozen=True)
 class _State:
-    """What an adjustment changes."""
+    """State changed by an adjustment."""
 
     camera: Camera
     corrections: Mapping[str, Shifts]
@@ -99,13 +98,13 @@ class _State:
 
     @staticmethod
     def of(matches: KeyframeMatches) -> "_State":
-        """As it is now."""
+        """Save the present state."""
         each = [(k, k.T_cw.clone(), k.inverse_depth, k.information) for k in matches.keyframes]
         edges, corrections = dict(matches.graph.edges), dict(matches.corrections)
         return _State(matches.camera, corrections, edges, each)
 
     def restore(self, matches: KeyframeMatches) -> None:
-        """Have it as it was."""
+        """Restore the saved state."""
         matches.graph.see_by(self.camera)
         matches.graph.replace(self.edges)
         matches.corrections.clear()
@@ -116,19 +115,19 @@ class _State:
 
 
 class _Intrinsics:
-    """Errors of the shared intrinsics and of each keyframe's that matches are corrected for."""
+    """Estimated corrections of the shared intrinsics and of each keyframe's."""
 
     def __init__(self, matches: KeyframeMatches, before: FrameLenses) -> None:
         self.prior = before.prior or VaryingPrior()
         self.left = 0.0
-        """Largest relative cost reduction by a parameter that is fixed, as estimated last."""
+        """Largest relative cost reduction by a fixed parameter, as estimated last."""
         self._matches, self._keyframes = matches, matches.keyframes
         self._own = {
             k.id: torch.tensor(before.each[k.frame_index].sizes, dtype=torch.float64)
             for k in matches.keyframes if k.frame_index in before.each
         }  # fmt: skip
         self._common = torch.zeros(SHAPES, dtype=torch.float64)
-        """By which the camera was moved."""
+        """Total change of the camera."""
         deviation = self._keyframes.table.focal_deviation
         self._is_open = deviation > 0
         expected = lens_prior(deviation) if self._is_open else SHAPES * (GIVEN,)
@@ -149,7 +148,7 @@ class _Intrinsics:
         return is_freed
 
     def step(self, evidence: Evidence) -> float:
-        """Take a step; its largest RMS over the keyframes, 0 without evidence."""
+        """Take a step; return its largest RMS over the keyframes, 0 without evidence."""
         if not evidence:
             return 0.0
         steps, self.prior, _ = self._estimated(evidence, self.prior)
@@ -169,7 +168,7 @@ class _Intrinsics:
     def _estimated(
         self, evidence: Evidence, prior: VaryingPrior
     ) -> tuple[list[Tensor], VaryingPrior, float]:
-        """Steps of all parts, the prior after EM, and the largest relative cost reduction."""
+        """Return steps of all parts, the prior after EM, and the largest relative cost reduction."""
         steps, explained = [], 0.0
         for frames, part in evidence:
             times = [self._keyframes[k].timestamp for k in frames]
@@ -184,7 +183,7 @@ class _Intrinsics:
         return self._own.get(id, torch.zeros(len(OWN), dtype=torch.float64))
 
     def shifts(self, part: list[Pair]) -> Float[Tensor, "e p 2"]:
-        """Pixels to be added to the matches of some edges, as if the lens of all had seen them."""
+        """Return shifts of the matches of some edges to those of the shared lens, in pixels."""
         grid, keyframes = self._keyframes.grid, self._keyframes
         T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         at = project(grid.camera, grid.rays, T_ji, depth)
@@ -192,7 +191,7 @@ class _Intrinsics:
         return shifts_of_own(grid.camera, grid.rays, T_ji, at, both.to(at.pixels))
 
     def found(self) -> FrameLenses:
-        """Intrinsics of each frame."""
+        """Return the intrinsics of each frame."""
         known = {k.frame_index: self._of(k.id) for k in self._keyframes}
         sizes = sizes_of_frames(self._matches.log, self._keyframes, known, self.prior)
         varies = torch.tensor(self.prior.jitter) > 0

@@ -1,10 +1,10 @@
 """Shared intrinsics in the adjustment of all keyframes: k1, k2, focal length, principal point.
 
-Images were undistorted by the given or found lens. The distortion that remains is small, and all
-matches of the video together determine it; a walk straight on drifts in scale until it is
-corrected. The camera of the grid becomes the one that was found and everything is adjusted again;
-matches stay as they are. The focal length is corrected with it where matches require that: one that
-was found for a pinhole is off by several percent (docs/notebook/lens.md).
+Images were undistorted by the given or estimated lens. The remaining distortion is small, and all
+matches of the video together determine it; a straight walk drifts in scale until it is corrected.
+The grid gets the estimated camera and everything is adjusted again; matches do not change. The
+focal length is corrected with it where matches require that: one estimated for a pinhole is off by
+several percent (docs/notebook/lens.md).
 """
 
 import math
@@ -32,30 +32,32 @@ from geogs.types import FoundLens
 from geogs.world.edges import Pair
 
 ROUNDS = 8
-"""At most. Poses and depths follow each to first order: it leaves a fifth to a half of what the one
-before it left."""
+"""Most rounds. Poses and depths follow each to first order: the error left is a fifth to a half of
+that of the round before."""
 CONVERGED = 0.2
-"""Standard deviations by which the last round may change a parameter."""
+"""Largest change of a parameter in the last round, in standard deviations."""
 MOST_AT_ONCE = 0.3
 """Largest step of the logarithm of the focal length in a round, as steps are to first order."""
 EVIDENCE, AGREEMENT = 49.0, 0.5
-"""Squared Mahalanobis distance from zero at which k1 and k2 beside a given lens are accepted, if
-they agree so far between the halves of the video (:meth:`LensEvidence.agreement`). Matches of
-different keyframes err alike and their evidence adds up: only what they err in differs from half to
-half (docs/notebook/lens.md)."""
+"""Squared Mahalanobis distance from zero above which k1 and k2 beyond a given lens are accepted,
+and least agreement between the halves of the video (:meth:`LensEvidence.agreement`). Errors of
+matches of different keyframes are correlated and their evidence adds up; but these errors differ
+from half to half (docs/notebook/lens.md)."""
 FOCAL_EVIDENCE = 6.0
-"""Standard errors at which a given focal length is corrected beside k1 and k2. Of a right one it is
-0 to 2.6, once 4.0, which halves of that video agreed on (docs/notebook/lens.md)."""
+"""Error of a given focal length, in standard errors, above which it is corrected with k1 and k2.
+For a correct one it is 0 to 2.6, once 4.0, on which halves of that video agreed
+(docs/notebook/lens.md)."""
 CENTRE_EVIDENCE = 64.0
-"""Squared Mahalanobis distance at which the principal point of a lens that is not given is taken
-off the middle. It is below 1 where it is there, above 80 where it is 3 % of the height off. With 36
-the kitchen has it corrected in one run and not in the next (docs/notebook/lens.md)."""
+"""Squared Mahalanobis distance above which the principal point of a lens that was not given is
+moved from the middle. It is below 1 where the middle is right, above 80 where it is off by 3 % of
+the height. With 36 the kitchen has it corrected in one run and not in the next
+(docs/notebook/lens.md)."""
 FOCAL_DOUBT = 0.05
-"""Relative deviation of the focal length from which on a given one is kept: k1 and k2 explain as
-well what matches know that badly."""
+"""Relative deviation of the estimated focal length above which a given one is kept: k1 and k2 then
+explain the matches equally well."""
 READOUT_DOUBT = 0.05
-"""Relative deviation of the readout from which on it is estimated, too: by matches it comes out
-2 to 6 % short itself (docs/notebook/lens.md)."""
+"""Relative deviation of the readout above which it is estimated, too: the estimate from matches is
+itself 2 to 6 % short (docs/notebook/lens.md)."""
 
 
 def correct_lens(
@@ -64,16 +66,16 @@ def correct_lens(
     before: FoundLens | None = None,
     readout: float = 1.0,
 ) -> FoundLens | None:
-    """Estimate the lens from all matches and adjust again; none, and everything as it was, where
-    nothing is found.
+    """Estimate the lens from all matches and adjust again; None, without changes, where there is no
+    correction.
 
-    The camera of the grid is the one that was found then. Beside a given lens k1 and k2 are
-    accepted by ``EVIDENCE`` and ``AGREEMENT``. All is estimated, however small, where something was
-    found ``before``, and where tracking ``ends`` and the focal length was found or guessed
+    The estimated camera becomes that of the grid. Beyond a given lens k1 and k2 are accepted by
+    ``EVIDENCE`` and ``AGREEMENT``. All parameters are estimated, however small, after an estimate
+    ``before``, and where tracking ``ends`` and the focal length was estimated or guessed
     (``KeyframeTable.focal_deviation``; the prior is
-    :func:`~geogs.bundle.uncertainty.lens_error.lens_prior`); then the principal point is, too. The
-    focal length is corrected at the end alone; so is a readout that was found: rows were corrected
-    for ``readout`` times it. Not in the world of a saved map, whose keyframes stay as they are.
+    :func:`~geogs.bundle.uncertainty.lens_error.lens_prior`); then also the principal point. The
+    focal length is only corrected at the end, and so is an estimated readout: rows were corrected
+    for ``readout`` times it. Not in the world of a saved map, whose keyframes are fixed.
     """
     if not matches.measured or matches.tracker.segment.fixed:
         return None
@@ -84,13 +86,13 @@ def correct_lens(
 
 
 class _LensSearch:
-    """Parameters of the lens, from round to round."""
+    """Iterative estimation of the lens parameters."""
 
     def __init__(
         self, matches: KeyframeMatches, ends: bool, before: FoundLens | None, readout: float
     ) -> None:
         self.left = ROUNDS
-        """Rounds that may follow."""
+        """Rounds left."""
         self._matches, self._table, self._ends = matches, matches.keyframes.table, ends
         self._before, self._readout, self._longer = before, readout, 0.0
         self._said: LensEstimate | None = None
@@ -100,7 +102,7 @@ class _LensSearch:
         self._rows = _rows_in_doubt(matches, readout) if ends else None
 
     def step(self) -> bool:
-        """Take a step; false without evidence, or where it is not enough for a given lens."""
+        """Take a step; False without evidence, or with too little against a given lens."""
         evidence = said_of_lens(self._matches.tracker, list(self._matches.free_depth), self._rows)
         if evidence is None:
             return False
@@ -122,15 +124,15 @@ class _LensSearch:
         return True
 
     def _contradicts_given(self, evidence: LensEvidence) -> bool:
-        """Whether matches say, and independent halves of the video agree, that a given lens has
-        another k1 and k2."""
+        """Whether matches require another k1 and k2 of a given lens, and independent halves of the
+        video agree on them."""
         if evidence.bend.evidence < EVIDENCE:
             return False
         halves = self._halves()
         return len(halves) == 2 and halves[0].agreement(halves[1]) >= AGREEMENT
 
     def _halves(self) -> list[LensEvidence]:
-        """Evidence of the keyframes of either half of the video by itself, where there is any."""
+        """Return the evidence of each half of the video alone, where there is any."""
         ids = list(self._matches.free_depth)
         halves = ids[: len(ids) // 2 + 1], ids[len(ids) // 2 :]
         found = (said_of_lens(self._matches.tracker, half, self._rows) for half in halves)
@@ -138,11 +140,11 @@ class _LensSearch:
 
     @property
     def _moves(self) -> tuple[float, ...]:
-        """Sizes by which the camera is another than was given."""
+        """Changes of the camera relative to the given one."""
         return self._matches.camera.moves_from(self._table.camera)
 
     def _chosen(self, evidence: LensEvidence) -> LensEstimate:
-        """The estimate of the free parameters, with their priors."""
+        """Return the estimate of the free parameters, with their priors."""
         said = evidence.whole(self._frees_centre)
         shapes = SHAPES if self._frees_centre else RADIAL
         if self._is_open:
@@ -158,7 +160,7 @@ class _LensSearch:
         return evidence.bend if self._rows is None and not self._frees_centre else said.without(0)
 
     def _leave_centre_unless_sure(self, said: LensEstimate) -> None:
-        """Begin again with the principal point in the middle, unless it is clearly elsewhere."""
+        """Restart with the principal point in the middle, unless it is significantly elsewhere."""
         found = said.size.new_tensor(self._moves[RADIAL:])
         if said.of(slice(RADIAL, SHAPES))._replace(size=found).evidence < CENTRE_EVIDENCE:
             self._frees_centre, self.left = False, ROUNDS
@@ -166,12 +168,12 @@ class _LensSearch:
             self._matches.graph.see_by(replace(self._matches.camera, cx=given.cx, cy=given.cy))
 
     def _shifts(self, rows: RowErrors, part: list[Pair]) -> Float[Tensor, "e p 2"]:
-        """Pixels to be added to the matches of some edges for the readout as it is known now."""
+        """Return the shifts of the matches of some edges, in pixels, for the present readout."""
         matches = self._matches
         return self._longer * row_shifts(rows, matches.keyframes, part, matches.measured).slope
 
     def found(self) -> FoundLens | None:
-        """The lens, and its deviations."""
+        """Return the lens with its deviations; None if nothing was estimated."""
         if self._said is None:
             return None
         log, focal = self._matches.log, self._moves[0]
@@ -180,7 +182,7 @@ class _LensSearch:
             readout = self._readout + self._longer
             shift_rows(log, self._matches.keyframes, self._rows.with_readout(readout))
             log.set_readout(readout, deviation.pop())
-        # Matches of different keyframes err alike, here as before the run (docs/notebook/lens.md).
+        # Errors of different keyframes are correlated, as before the run (docs/notebook/lens.md).
         deviation = [STANDARD_ERRORS * error for error in deviation]
         open_focal = math.hypot(deviation.pop(0), FOCAL_LEFT * focal) if self._frees_focal else 0.0
         k1, k2, *of_centre = deviation
@@ -197,6 +199,6 @@ def _contradict_focal(said: LensEstimate) -> bool:
 
 
 def _rows_in_doubt(matches: KeyframeMatches, readout: float) -> RowErrors | None:
-    """Rows that were rectified by a readout of large deviation, where there are any."""
+    """Return rows rectified with a readout of large deviation, if any."""
     rows = row_errors(matches.log, matches.keyframes)
     return None if rows is None or rows.doubt < READOUT_DOUBT else rows.with_readout(readout)

@@ -1,10 +1,10 @@
-"""Rows of a rolling shutter in the adjustment of all keyframes, by the trajectory that it gives.
+"""Rows of a rolling shutter in the global adjustment, by its trajectory.
 
 The matches are those of images whose rows were rectified before anything was known of the scene.
-What is left follows from the adjusted trajectory and depths (``frames/row_errors.py`` of tracking),
-taken off the matches, and everything is adjusted again. Flow is not measured anew. A readout that
-was found in the video, and may be off by some percent, is found once more on the way: it is right
-where all matches together would become neither better nor worse with another.
+The remaining errors follow from the adjusted trajectory and depths (``frames/row_errors.py`` of
+tracking); matches are corrected for them, and everything is adjusted again. Flow is not measured
+again. A readout estimated from the video, which may be off by some percent, is estimated again on
+the way: at the right one the derivative of the cost of all matches is zero.
 """
 
 from collections.abc import Mapping
@@ -25,28 +25,27 @@ from geogs.world.edges import Pair, edge_matches
 from geogs.world.keyframes import KeyframeSet
 
 ROUNDS = 2
-"""Where the readout is not searched for: the first takes most of it."""
+"""Rounds without estimating the readout: the first removes most of the errors."""
 READOUTS = 3
-"""Tried after the first round, at most."""
+"""Most readouts tried after the first round."""
 SETTLED = 0.003
-"""Fraction of the readout by less than which a change ends the search."""
+"""Relative change of the readout below which the search ends."""
 BETWEEN = 4
-"""Steps of an adjustment that another follows, which goes on from there."""
+"""Steps of all adjustments but the last, which continues from them."""
 MOVES = 0.6
-"""Part of a lens's motion that rows have to show for it to move while they are read."""
+"""Fraction of a lens's motion that rows have to show for it to move during readout."""
 FIRST_STEP, FARTHEST = 0.04, 0.25
-"""Fraction of the readout that is tried first, and by which it changes at most."""
+"""First relative step of the readout, and its largest relative change."""
 
 
 def correct_rows(matches: KeyframeMatches, finds_readout: bool = True) -> float:
-    """Correct all matches for their rows and adjust again; nothing where no rows were rectified.
+    """Correct all matches for row errors and adjust again; nothing where no rows were rectified.
 
-    What was measured of the frames between the keyframes is corrected, too. ``finds_readout`` says
-    whether the readout is found once more, where it was found in the video. Returns how many times
-    the readout it is.
+    Matches of the frames between the keyframes are corrected, too. With ``finds_readout``, a
+    readout estimated from the video is estimated again. Returns its ratio to the former readout.
     """
     keyframes, log, search, last = matches.keyframes, matches.log, _Search(), ROUNDS - 1
-    matches.corrections.pop("readout", None)  # which the rows have by now
+    matches.corrections.pop("readout", None)  # now included in the rows
     measured = matches.corrected(but="rows")
     for n in range(1 + READOUTS):
         errors = row_errors(log, keyframes) if measured else None
@@ -74,15 +73,15 @@ def correct_rows(matches: KeyframeMatches, finds_readout: bool = True) -> float:
 def _shifts(
     errors: RowErrors, keyframes: KeyframeSet, measured: Measured, part: list[Pair]
 ) -> Float[Tensor, "e p 2"]:
-    """What brings the matches of some edges to where they would be if all rows were right."""
+    """Return the shifts that correct the matches of some edges for row errors."""
     return row_shifts(errors, keyframes, part, measured).shift
 
 
 def let_lenses_move(matches: KeyframeMatches, lenses: Mapping[int, FrameLens]) -> None:
-    """Let the principal points of frames' lenses move while rows are read, if the matches say so.
+    """Let the principal points of frames move during readout, if the matches support it.
 
-    A stabilised lens moves all the time, a crop is put elsewhere after an image was read. Matches
-    are corrected for these lenses.
+    A stabilised lens moves all the time, while a crop is moved after an image was read. Matches are
+    corrected for these lenses.
     """
     keyframes, log = matches.keyframes, matches.log
     still = row_errors(log, keyframes) if lenses else None
@@ -94,21 +93,21 @@ def let_lenses_move(matches: KeyframeMatches, lenses: Mapping[int, FrameLens]) -
 
 
 class _Search:
-    """Where the gradient of a cost is zero, by secants, kept near what was known before."""
+    """Search for the zero of a cost's gradient by secants, near the prior readout."""
 
     def __init__(self) -> None:
         self.factor = 1.0
         self._last: tuple[float, float] | None = None
 
     def step(self, gradient: float) -> None:
-        """Go on from the gradient at the present factor, which falls from it on."""
+        """Update the factor, given the gradient of the cost at the present one."""
         here = self.factor
         if self._last is None:
             self.factor -= FIRST_STEP if gradient > 0 else -FIRST_STEP
         else:
             before, there = self._last
             slope = (gradient - there) / (here - before) if here != before else 0.0
-            # No minimum lies there.
+            # Without a minimum go back to the prior.
             self.factor = here - gradient / slope if slope > 0 else 1.0
         self.factor = min(max(self.factor, 1 - FARTHEST), 1 + FARTHEST)
         self._last = here, gradient
@@ -117,8 +116,8 @@ class _Search:
 def _readout_gradient(
     matches: KeyframeMatches, measured: Measured, errors: RowErrors, factor: float
 ) -> float:
-    """Half the derivative of the cost by the factor on the readout, at that of ``errors``, and of
-    what was known of it."""
+    """Return half the derivative of the cost, including the prior, by the factor on the readout, at
+    that of ``errors``."""
     total = (factor - 1) / errors.doubt**2
     keyframes, huber = matches.keyframes, matches.options.huber
     grid = keyframes.grid

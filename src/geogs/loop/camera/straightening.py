@@ -1,4 +1,4 @@
-"""Images of keyframes as the map's pinhole sees them, once the lens was found."""
+"""Straightening of keyframe images for the map's pinhole, once the lens is estimated."""
 
 from geogs.camera.straight_view import FrameViews
 from geogs.threads import ordered_map, worker_count
@@ -6,10 +6,10 @@ from geogs.world.keyframes import KeyframeSet
 
 
 def straighten(keyframes: KeyframeSet, views: FrameViews) -> None:
-    """Have the images of keyframes as the table's pinhole sees them.
+    """Straighten the images of keyframes to the table's pinhole.
 
-    A prior's normals and a sensor's depths go along pixel by pixel. What was matched stays that of
-    the images as they were tracked.
+    A prior's normals and a sensor's depths are resampled, too. Matches still belong to the images
+    as tracked.
     """
     table, ids = keyframes.table, keyframes.ids
     arrays, view = table.arrays, {k.id: views.of(k.frame_index) for k in keyframes}

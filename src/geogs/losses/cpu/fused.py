@@ -1,7 +1,7 @@
-"""The mapper's losses on a CPU: value and gradient in one go, compiled and cut over threads.
+"""The mapper's losses on a CPU: value and gradient in one pass, compiled and split over threads.
 
-In float32; tested against the plain definitions in ``tests/oracles``. The gradient is made with the
-value, so the backward pass only scales it. Results do not depend on the number of threads.
+In float32; tested against the plain definitions in ``tests/oracles``. The gradient is computed with
+the value, so the backward pass only scales it. Results do not depend on the number of threads.
 """
 
 import functools
@@ -88,7 +88,7 @@ def _enlargement(source: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     at = ((np.arange(size) + 0.5) * (source / size) - 0.5).clip(0, source - 1)
     left = np.minimum(at.astype(np.int64), source - 1)
     weight = (at - left).astype(np.float32)
-    # A pixel without weight is not looked at, so that its missing depth does not matter.
+    # A pixel without weight is not read, so its missing depth does not matter.
     right = np.where(weight > 1e-3, left + 1, left)
     left = np.where(weight < 1 - 1e-3, left, right)
     return np.stack([left, right]), weight
@@ -130,7 +130,7 @@ class _MultiView(torch.autograd.Function):
                 height,
             )
         total = float(loss.sum(dtype=np.float64))
-        # d loss / d warped: [0] from elsewhere, [1] in all; empty unless needed.
+        # d loss / d warped: [0] from other terms, [1] in total; empty unless needed.
         g_image = np.zeros((2, height, width) if with_pose else (2, 0, 0), np.float32)
         if config.ssim_weight > 0:
             g_image = np.zeros((2, height, width), np.float32)

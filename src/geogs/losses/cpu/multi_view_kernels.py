@@ -1,9 +1,9 @@
 """The multi-view loss and its gradients over a span of rows, for float32 arrays.
 
-Three passes over the photometric image, each free to be cut into spans of rows: warp, correlate,
-pull back to the depth (and a fourth for the pose). A span writes only its own rows, and every sum
-has one order, so the result does not depend on how the image is cut. NaN must compare as NaN,
-hence no ``nnan``.
+Three passes over the photometric image, each of which may be cut into spans of rows: warp,
+correlate, pull back to the depth (and a fourth for the pose). A span writes only its own rows, and
+every sum has one order, so the result does not depend on how the image is cut. NaN must compare as
+NaN, so there is no ``nnan``.
 """
 
 import numpy as np
@@ -96,7 +96,7 @@ def enlarge_line(depth, y, rows, row_part, columns, column_part, line, geometry)
 
 @njit(**PART)
 def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
-    """Where the pixels of row ``y`` fall in the target, from their depth in ``geometry[5]``.
+    """Project the pixels of row ``y`` into the target, from their depth in ``geometry[5]``.
 
     ``min_depth_ratio``: least fraction of depth kept; ``last_u``, ``last_v``: largest u and v of
     the target. ``geometry`` (6, w) receives u, v, z (0 where out of view), du/dd, dv/dd.
@@ -131,7 +131,7 @@ def warp_rows(
     first, last, depth, rows, row_part, columns, column_part, reference, texture, target,
     target_depth, lenses, T, settings, warped, slope, mask, extra, loss,
 ):  # fmt: skip
-    """The target image through the reference's depth, rows ``first <= y < last``.
+    """Warp the target image through the reference's depth, rows ``first <= y < last``.
 
     rows, columns (2, n) and their parts: source pixels of the bilinear enlargement; lenses (3, 4):
     fx, fy, cx, cy of the reference, of the target, and of the target at its depth map's size; T
@@ -228,7 +228,7 @@ def correlate_rows(first, last, reference, texture, warped, mask, half, settings
 def window_sums(y, fields, half, line, sums):
     """Sums of the three fields over the windows around the pixels of row ``y``.
 
-    Does nothing where ``half`` is negative; the compiler, too, must know that it is not.
+    Does nothing if ``half`` is negative; the test also lets the compiler know that it is not.
     """
     if half < 0:
         return

@@ -3,7 +3,7 @@
 Each span works alone: it visits the rows around it again instead of writing outside itself, so the
 result does not depend on how the image is cut. Loops run over whole rows without branches for the
 compiler to vectorise, and functions take whole arrays and a row, because slices are slow to
-compile. NaN must compare as NaN, hence no ``nnan``.
+compile. NaN must compare as NaN, so there is no ``nnan``.
 """
 
 import numpy as np
@@ -158,7 +158,7 @@ def add_normal_gradient(lines, y, g_normal):
 
 @njit(**PART)
 def add_consistency(pull, r, push):
-    """Adds what each centre of row ``r`` pushed to its four neighbours."""
+    """Adds the gradients from each centre of row ``r`` to its four neighbours."""
     for i in range(pull.shape[1] - 2):
         pull[r, i] += push[0, i + 1]
         pull[r - 1, i + 1] += push[2, i + 1]

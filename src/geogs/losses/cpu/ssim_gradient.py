@@ -7,14 +7,14 @@ from jaxtyping import Float32
 from geogs.config import LossConfig
 from geogs.losses.kernel_settings import MIN_COVERAGE
 
-# Of Wang et al. 2004.
+# Constants of Wang et al. 2004.
 _C1, _C2, _SIGMA, _REACH = 0.01**2, 0.03**2, 1.5, 5
 _LINE = np.exp(-(np.arange(-_REACH, _REACH + 1) ** 2) / (2 * _SIGMA**2))
 _LINE = (_LINE / _LINE.sum()).astype(np.float64)
 
 
 def _blurred(image: np.ndarray) -> np.ndarray:
-    """Gaussian sums of windows, with nothing beyond the border: its own adjoint."""
+    """Gaussian window sums with zeros beyond the border; the filter is its own adjoint."""
     return cv2.sepFilter2D(image, -1, _LINE, _LINE, borderType=cv2.BORDER_CONSTANT)
 
 
@@ -44,7 +44,7 @@ def ssim_gradient(
     weight = config.ssim_weight / mask.size
     loss = weight * float((used * (1 - luminance * structure)).sum())
 
-    # The slopes in the three sums over the window that the warped image is part of.
+    # Derivatives by the three window sums that contain the warped image.
     out = -weight * used / covered
     d_luminance = 2 * (mean_a - luminance * mean_b) / below
     d_variance, d_covariance = -structure / lower, 2 / lower

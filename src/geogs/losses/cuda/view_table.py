@@ -41,15 +41,15 @@ class ViewTable:
         self.photo = photo
         self.device = device
         self.generation = 0
-        """Rises whenever ``pointers``, ``poses``, ``rendered`` and ``deviations`` are other tensors
-        than before."""
+        """Increases whenever ``pointers``, ``poses``, ``rendered`` and ``deviations`` become other
+        tensors."""
         self.pointers: Int[Tensor, "slots fields"] = torch.zeros(
             capacity, len(ViewField), dtype=torch.int64, device=device
         )
         """Addresses of each slot's maps, 0 where it has none."""
         self.planes: list[Int[Tensor, "slots fields"]] = [self.pointers]
-        """The same with each plane of the photometric image for the grey one, which comes first;
-        colours where the first slot was given some."""
+        """Pointers with each plane of the photometric image in place of the grey one, which comes
+        first; colours if the first slot was given some."""
         self.poses: Float[Tensor, "slots 12"] = torch.zeros(
             capacity, 12, dtype=torch.float64, device=device
         )
@@ -92,7 +92,7 @@ class ViewTable:
         return slot
 
     def replace(self, slot: int, view: ViewConstants, photo: PhotoView) -> None:
-        """Let a slot stand for another keyframe, whose rendering is not known yet.
+        """Give a slot to another keyframe, whose rendering is not known yet.
 
         All maps stay where they are, so captured graphs remain valid.
         """
@@ -126,7 +126,7 @@ class ViewTable:
         return self._maps[slot][4]
 
     def forget_rendered(self) -> None:
-        """No rendered depth counts any more, as after the map has moved."""
+        """Discard all rendered depths, as after the map has moved."""
         self.rendered.zero_()
 
     def _set_noise(self, slot: int, photo: PhotoView) -> None:

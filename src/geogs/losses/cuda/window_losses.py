@@ -1,8 +1,8 @@
 """The losses of a window of views and their gradients, in a few kernel launches.
 
 Same definitions as :mod:`geogs.losses.cpu`, in float32, for all views and pairs at once. The
-gradient is made with the value. A launch allocates nothing and never waits for the device, so it
-can be part of a captured graph; the views and pairs may change between replays.
+gradient is computed with the value. A launch allocates nothing and never waits for the device, so
+it can be part of a captured graph; the views and pairs may change between replays.
 """
 
 from enum import IntFlag
@@ -208,7 +208,7 @@ class WindowLosses:
     ) -> None:
         """Keep the visible depth of views for other views' occlusion tests; slots -1 are skipped.
 
-        Of the same slot twice one is kept.
+        If a slot comes twice, one of its depths is kept.
         """
         pixels = depth.shape[1] * depth.shape[2]
         self._kernels["store_rendered"](

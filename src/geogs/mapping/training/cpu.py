@@ -25,8 +25,8 @@ from geogs.world.disks import DiskParameters, GaussianMap
 # Largest fraction of the map that is trained as an excerpt.
 _LARGE_EXCERPT = 0.7
 COARSE_PART = 0.5
-"""Fraction of a training over all keyframes, its first, at half the resolution: coarse errors are
-corrected there in half of the time."""
+"""First fraction of a training over all keyframes, at half the resolution: it corrects coarse
+errors in half of the time."""
 LEAST_COARSE = 100
 """Least long edge of a rendering at half the resolution."""
 # Standard deviations at which a disk of any opacity has faded below what the renderer shows.
@@ -150,7 +150,7 @@ class CpuTrainer:
             return 0.0
         if self.config.photo.fresh:
             self._show_partners(batch)
-        # Side by side, as much of a pass is done by one thread; added up in order.
+        # In parallel, as much of a pass is done by one thread; summed in order.
         passes = thread_map(lambda pair: self._pass(*pair, coarse), batch)
         visible = torch.zeros(len(self.disks), dtype=torch.bool, device=self.disks.device)
         total = 0.0

@@ -17,11 +17,11 @@ from geogs.world.map import MapTable, TrainingPlace
 if TYPE_CHECKING:
     from geogs.mapping.training.trainer_choice import MapTrainer
 
-# Most views that are shuffled all together, about as many as stay in memory; of more, so many.
+# Most views that are shuffled all together, about as many as stay in memory; else the block size.
 _SHUFFLED, _BLOCK = 128, 32
 # Most steps between two reports of progress.
 _REPORTED_STEPS = 20
-# Steps that are timed, and again so often if they take less than so many seconds.
+# Number of timed steps; seconds below which they are repeated, and how often.
 _REHEARSED_STEPS, _ENOUGH_SECONDS, _REHEARSALS = 16, 0.2, 8
 
 
@@ -82,7 +82,7 @@ class FullTraining:
             progress(done / total)
 
     def _draw(self) -> list[tuple[MapView, list[MapView]]]:
-        """The next view, in random order, each once before any comes again."""
+        """Draw the next view in random order; each comes once before any comes again."""
         table = self._table
         if not table.order:
             table.order = random_order(len(self._mapped), table.random.of_numpy).tolist()
@@ -99,10 +99,10 @@ class FullTraining:
 
 
 def random_order(count: int, random: np.random.Generator) -> Int64[np.ndarray, "n"]:
-    """The numbers below ``count``, shuffled; of a long video, in blocks of consecutive keyframes.
+    """The numbers below ``count``, shuffled; for a long video, in blocks of consecutive keyframes.
 
-    The blocks come in random order, shuffled within. Their views have most partners in common, so
-    that few of either are read from the file.
+    The blocks come in random order, shuffled within. Views of a block have most partners in common,
+    so few views are read from the file.
     """
     if count <= _SHUFFLED:
         return random.permutation(count)
@@ -113,7 +113,7 @@ def random_order(count: int, random: np.random.Generator) -> Int64[np.ndarray, "
 def seconds_per_step(
     table: MapTable, views: KeyframeViews, trainer: "MapTrainer", config: MappingConfig
 ) -> float:
-    """Seconds for a training step, measured on some at full rate, on more if these are quick."""
+    """Seconds for a training step, measured on some at full rate; on more if these are quick."""
 
     def rehearse(steps: int) -> float:
         start = time.perf_counter()

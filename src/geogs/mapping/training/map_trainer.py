@@ -16,7 +16,7 @@ LR_QUATERNION, LR_SCALE, LR_OPACITY = 4e-3, 0.08, 0.1
 HISTORY = 2
 """Older keyframes drawn at random into each window, as in the paper, so that none is forgotten."""
 GRADIENT_LIMIT = 1e3
-"""A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
+"""Gradient of a disk above which it is a numerical failure (of a nearly edge-on pixel)."""
 
 
 def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> LearningRates:
@@ -32,7 +32,7 @@ def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> L
 def draw_views(
     mapped: list[int], steps: int, config: MappingConfig, random: np.random.Generator
 ) -> list[list[int]]:
-    """Ids of the views of some training steps: of the recent window and random older keyframes.
+    """Draw the views of some training steps: from the window and from random older keyframes.
 
     The older ones are drawn once for all steps, as they may have to be read from a file. With
     ``views_per_step`` 0 every step has the whole window and its history, as the paper sums them;
@@ -59,7 +59,7 @@ def draw_batch(
     config: MappingConfig,
     random: np.random.Generator,
 ) -> Batch:
-    """Some views, each with some of its partners at random."""
+    """The given views, each with some of its partners at random."""
     return [(views[i], _draw_partners(views[i], views, config, random)) for i in ids]
 
 

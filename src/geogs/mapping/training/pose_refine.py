@@ -22,7 +22,7 @@ BETAS, EPSILON = (0.9, 0.999), 1e-8
 class TangentAdam:
     """Adam (Kingma & Ba 2015) on one small tensor.
 
-    As ``torch.optim.Adam``, whose first use imports PyTorch's compiler, which takes seconds.
+    It replaces ``torch.optim.Adam``, whose first use imports PyTorch's compiler for seconds.
     """
 
     def __init__(self, parameter: Tensor, rate: float) -> None:
@@ -42,13 +42,13 @@ class TangentAdam:
 
 
 Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
-"""The loss of some poses, and something differentiable whose gradient is the loss's."""
+"""The loss of some poses, and a differentiable scalar with the same gradient."""
 
 
 def descend(
     start: Float[Tensor, "k 4 4"], config: MappingConfig, unit: float, evaluate: Evaluate
 ) -> Float[Tensor, "k 4 4"]:
-    """Poses near ``start`` of less loss; the first is fixed.
+    """Minimise the loss from ``start``; the first pose is fixed.
 
     Adam on left perturbations [tau, phi], tau in units of the map's depth. The step with the least
     loss is returned; where no step lowered the loss the poses come back as they were.

@@ -1,4 +1,4 @@
-"""Where the map is trained: on the CPU, or on the GPU that holds it."""
+"""Choice of the map's trainer: on the CPU, or on the GPU that holds the map."""
 
 from typing import TYPE_CHECKING
 

@@ -1,1 +1,1 @@
-"""A mesh with fewer triangles."""
+"""Decimation of a mesh to fewer triangles."""

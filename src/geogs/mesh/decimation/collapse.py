@@ -1,4 +1,4 @@
-"""Edge collapse by quadric error, at many places at once."""
+"""Edge collapse by quadric error, of many edges at once."""
 
 from copy import copy
 from pathlib import Path
@@ -15,19 +15,19 @@ _THREADS = 128
 _SPAN = 16384
 """Vertices or faces that a thread of the CPU takes at a time."""
 _CHEAPEST = 0.8
-"""Part of the edges that may be collapsed next, the cheapest."""
+"""Fraction of the edges, the cheapest, that may be collapsed next."""
 _SAMPLES = 20_000
 _MOST_ROUNDS = 300
 _LEAST_PROGRESS = 0.0005
-"""Part of the faces that a round has to take away."""
+"""Least fraction of the faces that a round has to remove."""
 
 
 class CollapsingMesh:
     """A mesh whose edges are collapsed, on the device where it lies; those at borders are not.
 
     In a round every edge is collapsed that is among the cheapest of the whole mesh and the cheapest
-    at both of its ends, unless a cheaper such edge is near. Neither threads nor the device's order
-    of work change what comes out.
+    at both of its ends, unless a cheaper such edge is near. The result depends neither on threads
+    nor on the device's order of work.
 
     Method: quadric error (Garland and Heckbert 1997), each plane weighted by its face's area.
     """
@@ -36,9 +36,9 @@ class CollapsingMesh:
         """``vertices`` in map units; ``faces`` of int32. Neither is changed."""
         device, count = vertices.device, len(vertices)
         self.became = torch.arange(count, device=device)
-        """What each of the vertices given is now, -1 where it has no face."""
+        """Current vertex of each original one, -1 if it has no face."""
         self.position = vertices.double()
-        """float64."""
+        """Positions of the current vertices, float64."""
         self._corners = faces.flatten()
         self._parent = torch.arange(count, dtype=torch.int32, device=device)
         self._quadric = torch.empty((count, 10), dtype=torch.float64, device=device)
@@ -50,14 +50,14 @@ class CollapsingMesh:
 
     @property
     def faces(self) -> Int[Tensor, "l 3"]:
-        """int32."""
+        """Vertices of the current faces, int32."""
         return self._corners.view(-1, 3)
 
     def reduced(self, bound: float) -> "CollapsingMesh":
         """The mesh after nearly all edges up to a cost were collapsed, in map units.
 
-        A cost is the root of what an edge costs by area: of the mean square of the merged vertex's
-        distances to the planes of all faces that it stands for, and of a hundredth of the length.
+        The cost of an edge is the root of a sum: the mean square, by area, of the merged vertex's
+        distances to the planes of all its faces, and the square of a hundredth of the length.
         """
         new = copy(self)
         for name in ("position", "_corners", "_quadric", "_cost", "_parent"):
@@ -78,8 +78,8 @@ class CollapsingMesh:
     def means(
         self, values: Float[Tensor, "n c"], known: Bool[Tensor, "n"]
     ) -> tuple[Float[Tensor, "k c"], Bool[Tensor, "k"]]:
-        """Means of the known values of the vertices given that became each of those now; where
-        there are any."""
+        """Mean of the known values of the original vertices merged into each current one, and
+        whether there are any."""
         known = known & (self.became >= 0)
         index, count = self.became[known], len(self.position)
         total = values.new_zeros(count, values.shape[1]).index_add_(0, index, values[known])
@@ -99,14 +99,14 @@ class CollapsingMesh:
         self._squeeze()
 
     def _limit(self) -> Float[Tensor, "1"]:
-        """The cost of the dearest edge that may be collapsed now."""
+        """Highest cost of an edge that may be collapsed now."""
         some = self._cost[:: 1 + len(self._cost) // _SAMPLES].sort().values
         finite = torch.isfinite(some).sum()
         place = (finite * _CHEAPEST).long().clamp(max=len(some) - 1)
         return some.index_select(0, place[None]).clamp(max=torch.finfo(torch.float32).max)
 
     def _squeeze(self) -> None:
-        """Leave out faces of which two corners were merged."""
+        """Remove faces of which two corners were merged."""
         corners, cost = self._corners, self._cost
         if corners.device.type == "cpu":
             from geogs.mesh.decimation.collapse_kernels import squeeze
@@ -120,7 +120,7 @@ class CollapsingMesh:
         self._corners, self._cost = (x.view(-1, 3)[kept].flatten() for x in (corners, cost))
 
     def _renumber(self) -> None:
-        """Leave out vertices without a face."""
+        """Remove vertices without a face."""
         root = self._parent.long()
         while not torch.equal(further := root[root], root):
             root = further
@@ -135,7 +135,7 @@ class CollapsingMesh:
         self._parent = torch.arange(len(self.position), dtype=torch.int32, device=root.device)
 
     def _rings(self) -> tuple[Tensor, Tensor]:
-        """Where the corners at each vertex begin in the list of them, and that list.
+        """Index of each vertex's first corner in a list of corners by vertex, and that list.
 
         Corner 3 f + k is that of face f at its k-th vertex.
         """
@@ -150,7 +150,7 @@ class CollapsingMesh:
         return torch.searchsorted(vertex, steps, out_int32=True), corners.to(torch.int32)
 
     def _over(self, count: int, name: str, *arrays: Tensor) -> None:
-        """Run a kernel of the device for each of so many vertices or faces."""
+        """Run a kernel of the device for each of ``count`` vertices or faces."""
         if self._corners.device.type == "cuda":
             kernel = kernels_for(_SOURCE, self._corners.device)[name]
             kernel(-(-count // _THREADS), _THREADS, count, *arrays)

@@ -2,7 +2,7 @@
 
 Corner 3 f + k is that of face f at its k-th vertex, and stands for the edge from there to the next
 vertex of the face. Of the two corners of an edge the one at the lower vertex stands for it.
-Functions get numbers of corners and vertices as 64 bits, so that each is compiled once.
+Functions take corners and vertices as 64-bit integers, so that each is compiled once.
 """
 
 import math
@@ -15,18 +15,18 @@ NONE = 2**62
 _TOWARDS_MIDDLE = 1e-3
 _FLATTEST = 0.01
 _SHORT_FIRST = 1e-4
-"""A hundredth, squared: an edge is as dear as if its vertices moved by that part of its length, so
-that in planes short edges come first."""
+"""A hundredth, squared: an edge costs as much as if its vertices moved by that fraction of its
+length, so in planes short edges come first."""
 _LEAST_COSINE = 0.2
 _SCATTER, _GATHER = 2654435769, 340573321
-"""Their product is one, of 32 bits."""
+"""Their product is 1 modulo 2^32."""
 _LEVEL = 21
-"""Bits of a cost that ranks leave out; what is left tells costs apart by a quarter or less."""
+"""Bits of a cost that ranks leave out; the others resolve costs to a quarter or better."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rings(faces, count):
-    """Where the corners at each of ``count`` vertices begin in the list of them, and that list."""
+    """Index of each of ``count`` vertices' first corner in a list of corners, and that list."""
     first = np.zeros(count + 1, np.int32)
     for c in range(len(faces)):
         first[faces[c] + 1] += 1
@@ -117,8 +117,8 @@ def _add_plane(position, faces, c, quadric, v):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def merged(position, quadric, a, b):
-    """Where two vertices are merged: nearest to all planes of both, in the middle where these leave
-    it open. Also the squared distance to these, summed up by area, and the area."""
+    """Position of two merged vertices: nearest to all planes of both, in the middle where these
+    leave it open. Also the squared distance to these, summed by area, and the area."""
     xx, xy = quadric[a, 0] + quadric[b, 0], quadric[a, 1] + quadric[b, 1]
     xz, x1 = quadric[a, 2] + quadric[b, 2], quadric[a, 3] + quadric[b, 3]
     yy, yz = quadric[a, 4] + quadric[b, 4], quadric[a, 5] + quadric[b, 5]
@@ -127,7 +127,7 @@ def merged(position, quadric, a, b):
     x = 0.5 * (position[a, 0] + position[b, 0])
     y = 0.5 * (position[a, 1] + position[b, 1])
     z = 0.5 * (position[a, 2] + position[b, 2])
-    # Half the gradient there, and a step of Newton's, damped.
+    # Half the gradient there, and a damped Newton step.
     gx, gy, gz = (
         xx * x + xy * y + xz * z + x1,
         xy * x + yy * y + yz * z + y1,
@@ -154,8 +154,8 @@ def merged(position, quadric, a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def edge_cost(position, faces, quadric, fixed, bound, corner):
-    """Cost of the edge that a corner stands for; infinite where it stands for none or costs, by
-    area, more than the square of a bound."""
+    """Cost of the edge that a corner stands for; infinite if it stands for none or costs, by area,
+    more than the square of a bound."""
     a = np.int64(faces[corner])
     b = _after(faces, corner)
     if a >= b or fixed[a] or fixed[b]:
@@ -185,12 +185,12 @@ def _rank(bits, limit, corner):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def best_edges(low, high, first, corners, cost, limit, best):
-    """The lowest rank of the edges at each of the vertices that cost no more than a limit.
+    """The lowest rank, at each of the vertices, of the edges that cost no more than a limit.
 
-    Ranks are in the order of costs, scattered among those that are about the same; no two edges
-    have the same, and it tells the corner (:func:`ranked_corner`).
+    Ranks are in the order of costs, scattered among similar costs. Every edge has a rank of its
+    own, from which the corner follows (:func:`ranked_corner`).
     """
-    # Numbers that are not negative are in the order of their bits.
+    # Non-negative numbers are in the order of their bits.
     bits, limit = cost.view(np.int32), limit.view(np.int32)[0]
     for v in range(low, high):
         found = NONE
@@ -209,7 +209,7 @@ def ranked_corner(rank):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def match_vertices(low, high, faces, best, matched):
-    """The best edges of vertices that are so for both of their ends; each has one at most."""
+    """Match vertices by edges that are the best of both of their ends; at most one a vertex."""
     for v in range(low, high):
         matched[v] = NONE
         if best[v] != NONE:
@@ -225,7 +225,7 @@ def collapse(
     """Merge the ends of matched edges that rank lower than all others near.
 
     No two of them have a face in common, nor does one have an end next to another's: each changes
-    faces that no other looks at. Faces that two corners of are one are left for
+    faces that no other reads. Faces of which two corners are the same are left for
     :func:`squeeze`.
     """
     for a in range(low, high):
@@ -258,7 +258,7 @@ def collapse(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _update_costs(position, faces, first, corners, quadric, fixed, bound, cost, v):
-    """Costs anew of the edges that were at a vertex, now that its place and its number changed."""
+    """Update the costs of the edges that were at a vertex, whose position and index changed."""
     for i in range(first[v], first[v + 1]):
         leaving = np.int64(corners[i])
         coming = leaving + 2 if leaving % 3 == 0 else leaving - 1
@@ -278,7 +278,7 @@ def _is_first(faces, first, corners, matched, v):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _common(faces, first, corners, a, b):
-    """Neighbours that two vertices share."""
+    """Number of neighbours that two vertices share."""
     count = 0
     for i in range(first[a], first[a + 1]):
         x = _after(faces, np.int64(corners[i]))
@@ -317,8 +317,8 @@ def _keeps_sides(faces, first, corners, position, v, other, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def squeeze(faces, cost, left_faces, left_cost):
-    """Write the faces with three different corners, with their edges' costs; how many corners these
-    have."""
+    """Write the faces with three different corners, with their edges' costs; return the number of
+    their corners."""
     left = 0
     for f in range(0, len(faces), 3):
         a, b, c = faces[f], faces[f + 1], faces[f + 2]

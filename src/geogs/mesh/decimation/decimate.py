@@ -1,4 +1,4 @@
-"""A mesh with as few triangles as its surface needs."""
+"""Decimation of a mesh to as few triangles as its surface needs."""
 
 from dataclasses import replace
 
@@ -14,29 +14,29 @@ from geogs.mesh.denoise import denoised
 from geogs.mesh.triangle_mesh import Mesh
 
 QUANTILE = 0.99
-"""Part of the vertices that may not lie farther from the decimated surface than is allowed."""
+"""Fraction of the vertices that must lie within the tolerance of the decimated surface."""
 MEAN_FRACTION = 0.15
-"""Fraction of what is allowed that they may be off on average: else what is smooth becomes facets,
-all of it as far away as may be."""
+"""Largest mean distance of the vertices, as a fraction of the tolerance: else a smooth surface
+becomes facets that are as far away as allowed."""
 _SAMPLES = 10_000
 _BOUNDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 1.0)
-"""Fractions of what is allowed to which costs of edges are held, one after the other."""
+"""Successive bounds of the edges' costs, as fractions of the tolerance."""
 _WORTH_A_LOOK = 0.98
-"""Part of the triangles to which a wider bound has to bring a mesh, if that is to be checked."""
+"""Fraction of the triangles that a wider bound may leave for the mesh to be checked."""
 _FIRST_BOUND, _LAST_BOUND, _WIDER = 1e-4, 0.02, 1.5
-"""Of a mesh that is to have no more than so many triangles: the first bound and the last, of its
-extent, and what each is times the one before."""
+"""Bounds for a mesh with a largest number of triangles: the first and the last, as fractions of its
+extent, and the factor from one to the next."""
 _FEWEST = 200
-"""Triangles below which nothing is gained."""
+"""Number of triangles below which nothing is gained."""
 
 
 def decimate(mesh: Mesh, tolerance: float, smoothing: float = 0.0) -> Mesh:
     """Collapse edges by quadric error for as long as the surface stays where it was.
 
-    What is left is smoothed, by which its vertices move by ``smoothing`` (map units) at most.
+    The result is smoothed; this moves its vertices by at most ``smoothing`` (map units).
 
-    Colours are the means of those of the vertices that each new one stands for. Of a mesh that
-    this would not make smaller nothing changes. See :func:`merged`.
+    Colours are means over the vertices that each new one stands for. A mesh that this would not
+    make smaller stays as it is. See :func:`merged`.
     """
     few = merged(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces), tolerance)
     if few is None:
@@ -53,7 +53,7 @@ def merged(
     average within 15 % of that; borders stay as they are. Computed on the device of the vertices.
 
     Edges are collapsed up to some cost, and then up to higher ones, until the surface is off by
-    more than it may be.
+    more than allowed.
     """
     if tolerance <= 0 or len(faces) < _FEWEST:
         return None
@@ -70,7 +70,7 @@ def merged(
 
 
 def _deviation(mesh: CollapsingMesh, before: Float[Tensor, "n 3"]) -> Float[np.ndarray, "2"]:
-    """Distance to a mesh of the vertices before: that of nearly all of them, and the mean."""
+    """Distance of the original vertices to a mesh: the ``QUANTILE`` and the mean."""
     step = 1 + len(before) // _SAMPLES
     samples, became = before[::step], mesh.became[::step].clamp(min=0)
     arrays = samples, mesh.position.float(), mesh.faces, became
@@ -82,7 +82,7 @@ def _deviation(mesh: CollapsingMesh, before: Float[Tensor, "n 3"]) -> Float[np.n
 
 
 def with_at_most(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with no more than so many triangles; if it has no more, the same.
+    """Reduce a mesh to at most ``faces`` triangles; one with no more stays as it is.
 
     Edges are collapsed up to a cost that grows until they are few enough. Borders are not: if the
     mesh has too many, vertices are clustered in cubes that grow likewise.
@@ -120,7 +120,7 @@ def _clustered(mesh: Mesh, side: float) -> Mesh:
 
 
 def _coloured(mesh: Mesh, few: CollapsingMesh, vertices: Float[Tensor, "k 3"]) -> Mesh:
-    """A decimated mesh with its vertices; colours are means of those that each stands for."""
+    """Make a mesh of decimated vertices; colours are means over those that each stands for."""
     colours = None
     if mesh.colours is not None:
         given = torch.from_numpy(mesh.colours).float()

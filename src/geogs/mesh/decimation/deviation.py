@@ -1,4 +1,4 @@
-"""How far points lie from a mesh that should run through them."""
+"""Distances of points to a mesh that should run through them."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from geogs.geometry.neighbors import nearest_neighbors
 from geogs.threads import worker_count
 
 _NEAREST = 3
-"""Vertices around a point whose faces are looked at."""
+"""Vertices around a point whose faces are tested."""
 
 
 def host_deviations(
@@ -21,14 +21,14 @@ def host_deviations(
     """Distance of each point to the nearest face of those around the vertices nearest to it, and
     around one that is known to be near; every vertex has a face.
 
-    So it is the distance to the mesh, or a little more where faces differ much in size.
+    It is the distance to the mesh, or a little more where faces differ much in size.
     """
     from scipy.spatial import cKDTree
 
     from geogs.mesh.decimation.collapse_kernels import rings
     from geogs.mesh.decimation.deviation_kernels import nearest_faces
 
-    # Of a tree that is asked once, most of the time would go into balancing it.
+    # For a single query most of the time would go into balancing the tree.
     tree = cKDTree(vertices, balanced_tree=False, compact_nodes=False)
     _, near = tree.query(points, k=_NEAREST, workers=worker_count())
     near = np.column_stack([near, known])

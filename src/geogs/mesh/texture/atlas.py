@@ -13,12 +13,12 @@ from geogs.mesh.texture.patches import Patches
 from geogs.mesh.triangle_mesh import DepthMapView
 
 SWATCH = 3
-"""Side of the square of one colour that faces get which no view shows, pixels."""
+"""Side of a square of plain colour, for faces that no view shows, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """An image and where the corners of patches and the plain colours are in it."""
+    """An image and the positions in it of the corners of patches and of the plain colours."""
 
     image: UInt8[np.ndarray, "h w 3"]
     corner: Float64[np.ndarray, "n 2"]
@@ -38,10 +38,10 @@ def draw_atlas(
     """Draw the part of its view that each patch needs, its exposure compensated, into an atlas.
 
     Args:
-        patches: of the mesh.
-        views: their images.
-        gains: of the views; factors of the colours.
-        corrections: at the corners, added to the colours (0 to 255).
+        patches: patches of the mesh.
+        views: views with the images of the patches.
+        gains: factors of the views' colours.
+        corrections: offsets of the colours (0 to 255) at the corners.
         swatches: plain colours for the faces that no view shows.
         limit: longest side of the atlas, pixels.
 
@@ -78,7 +78,7 @@ def _patch(
     local: Float64[np.ndarray, "n 2"],
     size: tuple[int, int],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The pixels of a patch."""
+    """Draw the pixels of a patch."""
     view = int(patches.view[number])
     left, top, right, bottom = patches.box[number]
     crop = views[view].rgb()[top : bottom + 1, left : right + 1]

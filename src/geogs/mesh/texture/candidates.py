@@ -1,4 +1,4 @@
-"""Which views show each face of a mesh, and how well."""
+"""Search for the views that show each face of a mesh best."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 MAX_VIEWS = 8
-"""Views of a face that are kept, those that show it best."""
+"""Most views of a face that are kept, those that show it best."""
 LEAST_COSINE = 0.1
-"""Cosine between a face's normal and the ray to a view that shows it, at least."""
+"""Least cosine between a face's normal and the ray to a view that shows it."""
 DEPTH_SLACK = 0.02
-"""Part of the depth by which a face may lie off a depth map that shows it."""
+"""Fraction of the depth by which a face may lie off a depth map that shows it."""
 MARGIN = 1.5
-"""Pixels from the border of an image within which nothing is taken."""
+"""Width of the border of an image that is not used, pixels."""
 HIDDEN_CORNER_WEIGHT = 0.05
-"""Weight of a face of which one corner is hidden."""
+"""Weight of a face with one hidden corner."""
 _SHARP_POWER = 0.5
 
 
@@ -36,8 +36,8 @@ class Candidates:
 def find_candidates(mesh: Mesh, views: Sequence[DepthMapView], tolerance: float) -> Candidates:
     """Views that show each face: near ones from the front first, sharp ones before blurred ones.
 
-    A view shows a face whose corners project into its image, whose middle lies on its depth map
-    within ``tolerance`` map units and 2 % of the depth, two corners, too, and which faces it. One
+    A view shows a face that faces it, whose corners project into its image, and of which the middle
+    and two corners lie on its depth map within ``tolerance`` map units and 2 % of the depth. A face
     whose third corner is hidden counts less.
     """
     count = len(mesh.faces)
@@ -57,7 +57,7 @@ def find_candidates(mesh: Mesh, views: Sequence[DepthMapView], tolerance: float)
 def image_pixels(
     view: DepthMapView, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-    """Where world points are in the image of a view, and their depths."""
+    """Pixel positions of world points in the image of a view, and their depths."""
     T_cw = view.T_cw.cpu().numpy()
     camera = view.camera
     local = points @ T_cw[:3, :3].T + T_cw[:3, 3]
@@ -72,7 +72,7 @@ def image_pixels(
 def _seen_faces(
     mesh: Mesh, view: DepthMapView, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers of the faces that a view shows, pixels each covers, colours."""
+    """Indices of the faces that a view shows, pixels each covers, colours."""
     image = view.rgb()
     height, width = image.shape[:2]
     pixels, z = image_pixels(view, mesh.vertices.astype(np.float64))
@@ -131,7 +131,7 @@ def _sampled(image: UInt8[np.ndarray, "h w 3"], at: Float[np.ndarray, "n 2"]) ->
 
 
 def _sharpness(views: Sequence[DepthMapView]) -> Float[np.ndarray, "v"]:
-    """Root of the strength of each image's fine structure over the median image's, at most 1."""
+    """Root of the ratio of each image's fine structure to the median image's, at most 1."""
     strength = np.array([
         0.0 if view.image is None
         else cv2.Laplacian(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).std()
@@ -144,7 +144,7 @@ def _sharpness(views: Sequence[DepthMapView]) -> Float[np.ndarray, "v"]:
 def _enter(
     best: Candidates, view: int, faces: np.ndarray, score: np.ndarray, colour: np.ndarray
 ) -> None:
-    """Put a view in its place among the candidates of the faces, if it is good enough."""
+    """Insert a view among the candidates of the faces where it is good enough."""
     worst = best.score[faces].argmin(1)
     better = score > best.score[faces, worst]
     faces, worst = faces[better], worst[better]

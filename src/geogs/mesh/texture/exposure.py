@@ -1,4 +1,4 @@
-"""Brightness of the views made equal, and of the patches where they meet."""
+"""Exposure compensation of the views, and of the patches where they meet."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -8,11 +8,11 @@ from scipy.sparse.linalg import cg, spsolve
 from geogs.mesh.texture.candidates import Candidates
 
 MAX_GAIN = 2.0
-"""Most by which a view is made brighter or darker."""
+"""Largest factor by which a view is made brighter or darker."""
 _DARK, _BRIGHT = 10.0, 245.0
 _PRIOR, _ROUNDS, _HUBER = 0.02, 5, 0.05
 _STIFFNESS = 0.1
-"""How much two corners of an edge must have the same correction, beside patches that meet."""
+"""Weight of equal corrections at both ends of an edge; that of equal colours at seams is 1."""
 
 
 def view_gains(candidates: Candidates, views: int) -> Float32[np.ndarray, "v 3"]:
@@ -47,7 +47,7 @@ def _solve_gains(
 ) -> Float64[np.ndarray, "v"]:
     """Log gains g with g_first - g_second = log_ratio, each pulled to zero a little.
 
-    They are linear: each round solves for them outright, beside the least-squares loop.
+    The problem is linear: each round solves it directly, without the general least-squares loop.
     """
     gains = np.zeros(views)
     for _ in range(_ROUNDS):
@@ -68,7 +68,7 @@ def seam_corrections(
     edges: Int64[np.ndarray, "e 2"],
     colour: Float32[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """What to add at each corner of a patch so that patches agree at the vertices they share.
+    """Colour corrections at the corners of patches that make them agree at shared vertices.
 
     Smooth within each patch (Lempitsky & Ivanov 2007): minimises the squared differences between
     corrected colours of corners at the same vertex, and those of corrections along edges.
@@ -76,7 +76,7 @@ def seam_corrections(
     Args:
         corner_vertex: vertex of the mesh at each corner; a vertex on a seam has several corners.
         edges: pairs of corners along the edges of their patch.
-        colour: of each corner in its view, 0 to 255.
+        colour: colour of each corner in its view, 0 to 255.
     """
     count = len(corner_vertex)
     order = np.argsort(corner_vertex, kind="stable")
@@ -96,7 +96,7 @@ def seam_corrections(
 def _differences(
     one: Int64[np.ndarray, "k"], other: Int64[np.ndarray, "k"], count: int
 ) -> sparse.csr_matrix:
-    """The matrix that takes values to those at ``one`` less those at ``other``."""
+    """The matrix that takes values to those at ``one`` minus those at ``other``."""
     rows = np.tile(np.arange(len(one)), 2)
     values = np.repeat([1.0, -1.0], len(one))
     return sparse.coo_matrix(

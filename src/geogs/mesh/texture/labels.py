@@ -1,4 +1,4 @@
-"""One view for each face: a good one, and mostly that of its neighbours, so that patches are large.
+"""Choice of a view for each face: a good one, mostly that of its neighbours for large patches.
 
 The energy is that of Lempitsky and Ivanov (2007), minimised by iterated conditional modes over the
 candidates of each face.
@@ -10,9 +10,9 @@ from jaxtyping import Float32, Int, Int32, Int64
 from geogs.mesh.texture.candidates import Candidates
 
 SMOOTHNESS = 0.35
-"""Cost of a neighbour with another view, beside 1 - score / best score."""
+"""Cost of a neighbour with another view, relative to 1 - score / best score."""
 MAX_COLOUR_DISTANCE = 40.0
-"""Distance of a view's colour from the median of a face's views that makes it an odd one out."""
+"""Distance of a view's colour from the median of a face's views above which it is an outlier."""
 _ROUNDS = 12
 
 
@@ -28,9 +28,9 @@ def face_neighbours(faces: Int[np.ndarray, "m 3"]) -> Int64[np.ndarray, "k 2"]:
 def without_colour_outliers(
     candidates: Candidates, gains: Float32[np.ndarray, "v 3"]
 ) -> Float32[np.ndarray, "m k"]:
-    """Scores, zero for views that show another colour than most do: something stands before them.
+    """Scores, zero for views that show another colour than most do: something hides the face.
 
-    Faces with fewer than three views, or all views odd, keep theirs.
+    Faces with fewer than three views, or only outliers, keep theirs.
     """
     has_view = candidates.view >= 0
     colour = candidates.colour * gains[candidates.view.clip(0)]

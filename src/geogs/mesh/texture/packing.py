@@ -1,4 +1,4 @@
-"""Rectangles on shelves: where each patch lies in the atlas."""
+"""Packing of the patches' rectangles on shelves of the atlas."""
 
 import math
 
@@ -42,7 +42,7 @@ def pack(
 def scale_that_fits(
     sizes: Int64[np.ndarray, "n 2"], limit: int, fixed: int
 ) -> tuple[Int64[np.ndarray, "n 2"], Int64[np.ndarray, "n 2"], tuple[int, int]]:
-    """Sizes scaled alike, at most by 1, so that they fit; their places; the size of the atlas.
+    """Sizes scaled alike, at most by 1, so that they fit; their positions; the size of the atlas.
 
     The last ``fixed`` rectangles keep their size.
 

@@ -1,4 +1,4 @@
-"""Connected faces that take their colours from one view, and what of its image they need."""
+"""Connected faces that take their colours from one view, and the part of its image they need."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from geogs.mesh.texture.candidates import image_pixels
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 PADDING = 2
-"""Pixels of the image around a patch that come along, so that sampling finds no foreign ones."""
+"""Margin of image pixels around a patch, so that sampling finds no foreign ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,15 +21,15 @@ class Patches:
 
     view: Int64[np.ndarray, "p"]
     faces: Int64[np.ndarray, "m"]
-    """Numbers of the seen faces, patch by patch."""
+    """Indices of the seen faces, patch by patch."""
     start: Int64[np.ndarray, "k"]
-    """Where each patch begins in ``faces``; one more at the end."""
+    """Index in ``faces`` of each patch's first face; one more at the end."""
     corners: Int64[np.ndarray, "m 3"]
     """Corners of each of ``faces``."""
     corner_vertex: Int64[np.ndarray, "n"]
     corner_patch: Int64[np.ndarray, "n"]
     pixel: Float64[np.ndarray, "n 2"]
-    """Where each corner is in the image of its view."""
+    """Pixel position of each corner in the image of its view."""
     box: Int64[np.ndarray, "p 4"]
     """Left, top, right and bottom pixel of the image that a patch needs, all included."""
 
@@ -46,7 +46,7 @@ def cut_patches(
     label: Int32[np.ndarray, "m"],
     neighbours: Int64[np.ndarray, "e 2"],
 ) -> Patches:
-    """Patches of faces with the same view that hang together by their edges."""
+    """Patches of faces with the same view that are connected by edges."""
     together = neighbours[label[neighbours[:, 0]] == label[neighbours[:, 1]]]
     count = len(label)
     links = sparse.coo_matrix((np.ones(len(together)), together.T), (count, count))

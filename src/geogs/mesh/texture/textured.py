@@ -1,4 +1,4 @@
-"""A mesh with an image for its surface, made from the images of its views."""
+"""Texturing of a mesh from the images of its views."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,34 +21,34 @@ _COLOUR_STEP = 8
 
 @dataclass(frozen=True, slots=True)
 class TexturedMesh:
-    """Triangles in the world frame with a texture; vertices on seams are there several times."""
+    """Triangles in the world frame with a texture; vertices on seams are repeated."""
 
     vertices: Float[np.ndarray, "n 3"]
     """float32, map units."""
     faces: Int32[np.ndarray, "m 3"]
-    """In the order of the mesh that it was made from."""
+    """Vertices of each face, in the order of the original mesh."""
     normals: Float[np.ndarray, "n 3"]
     uv: Float[np.ndarray, "n 2"]
-    """Pixels of the texture, whose centres are at integers."""
+    """Positions in the texture, pixels with centres at integers."""
     texture: UInt8[np.ndarray, "h w 3"]
     """RGB."""
     seen: float
-    """Part of the faces that an image shows; the others have a plain colour."""
+    """Fraction of the faces that an image shows; the others have a plain colour."""
 
 
 def texture_mesh(
     mesh: Mesh, views: Sequence[DepthMapView], tolerance: float, limit: int = 4096
 ) -> TexturedMesh:
-    """Give a mesh an image, put together from those of the views.
+    """Give a mesh a texture, composed of the images of the views.
 
     Each face gets the view that shows it largest and sharpest, with a preference for that of its
-    neighbours; the views' exposures are compensated, and what is left of the seams is
-    spread over the patches.
+    neighbours; the views' exposures are compensated, and remaining differences at seams are spread
+    over the patches.
 
     Args:
-        mesh: with colours for the faces that no view shows; grey without.
-        views: depth maps with images; each is asked for once or twice.
-        tolerance: how far a face may lie off a depth map that shows it, map units.
+        mesh: the mesh; faces that no view shows take its colours, grey if it has none.
+        views: depth maps with images; each is read once or twice.
+        tolerance: largest distance of a face from a depth map that shows it, map units.
         limit: longest side of the image, pixels.
 
     Raises:
@@ -93,7 +93,7 @@ def _corner_colours(
 def _plain_colours(
     mesh: Mesh, label: Int32[np.ndarray, "m"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The faces that no view shows, their different colours, and which each has."""
+    """The faces that no view shows, their different colours, and the index of each face's."""
     faces = np.flatnonzero(label < 0)
     if mesh.colours is None:
         colour = np.full((len(faces), 3), _GREY)

@@ -1,7 +1,7 @@
-"""How many blocks a volume takes, by every pixel of every view, and the voxel with which they fit.
+"""Number of blocks of a volume, from every pixel of every view, and the voxel with which they fit.
 
-A sample of the pixels tells it of a surface that many of them see. What scatters, such as trees and
-the far end of an outdoor view, has blocks of its own for each further pixel.
+A sample of the pixels suffices for a surface that many of them see. A scattered surface, such as
+trees and the far end of an outdoor view, has further blocks for each further pixel.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, footprint_points, p
 COARSER = 1.1
 """Growth of the voxels from one trial to the next."""
 _CELLS_PER_BLOCK = 3
-"""Half blocks with surface for each block that fits, from which on larger voxels are certain."""
+"""Half blocks with surface, per block that fits, above which voxels are certainly too small."""
 
 
 def fitting_voxel(
@@ -29,8 +29,8 @@ def fitting_voxel(
     most: int,
     contraction: Contraction,
 ) -> tuple[float, int]:
-    """The voxel, or the least one larger by steps of ``COARSER``, of which ``most`` blocks hold
-    the surface of all views with its band, and how many do.
+    """The voxel, or the least one larger by steps of ``COARSER``, with which ``most`` blocks hold
+    the surface of all views with its band; and the number of blocks.
 
     ``truncation`` is in voxels; pixels beyond ``max_depth`` are left out.
     """
@@ -48,7 +48,7 @@ def fitting_voxel(
 def fitting(
     points: Float[Tensor, "n 3"], voxel: float, truncation: float, most: int
 ) -> tuple[float, int]:
-    """:func:`fitting_voxel` of a surface that some points of contracted space sample."""
+    """:func:`fitting_voxel` for a surface sampled by points of contracted space."""
     while (blocks := len(band_blocks(points, voxel, truncation))) > most:
         voxel *= COARSER
     return voxel, blocks
@@ -65,7 +65,7 @@ def _surface(
 
 
 def _cells(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:
-    """Keys of the half blocks that points lie in, but for those out of the volume's reach."""
+    """Keys of the half blocks that points lie in, except those out of the volume's reach."""
     cells = torch.floor(points / (voxel * HALF)).long()
     return pack(cells[(cells.abs() < LIMIT // HALF).all(-1)])
 

@@ -1,7 +1,7 @@
-"""Space drawn together far from the cameras, so that one grid suits what is near and what is far.
+"""Contraction of space far from the cameras, so that one grid suits near and far surfaces.
 
-Depth that two views tell is known the worse the farther away it is, by the square of the distance.
-So are the voxels of a grid in contracted space large: scene contraction (Barron et al. 2022).
+The error of a depth from two views grows with the square of the distance. So does the size of the
+voxels of a grid in contracted space: scene contraction (Barron et al. 2022).
 """
 
 import math
@@ -11,29 +11,29 @@ from jaxtyping import Float
 from torch import Tensor
 
 NEAREST_TO_RIM = 1e-6
-"""Part of the radius that contracted points keep from the sphere that stands for infinity."""
+"""Fraction of the radius that contracted points keep from the sphere that stands for infinity."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contraction:
-    """Points x of the world and contracted ones y, which are the same within a ball.
+    """Map between points x of the world and contracted ones y, the same within a ball.
 
     Beyond its radius R, of distances from its centre, |y| = R (2 - R / |x|): all of the world lies
-    within 2 R. A step along the way from the centre is (|x| / R)^2 times as long in the world, one
+    within 2 R. A step along the ray from the centre is (|x| / R)^2 times as long in the world, one
     across it less.
     """
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """World frame."""
+    """Centre of the ball, world frame."""
     radius: float = math.inf
-    """Map units; where it is infinite nothing is contracted."""
+    """Radius of the ball, map units; if infinite, nothing is contracted."""
 
     def __bool__(self) -> bool:
         """Whether anything is contracted."""
         return math.isfinite(self.radius)
 
     def contracted(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Where points of the world lie in contracted space."""
+        """Contracted positions of world points."""
         if not self:
             return points
         away, distance = self._away(points)
@@ -41,9 +41,9 @@ class Contraction:
         return points + away * (outer * (2 - outer) - 1)
 
     def expanded(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Where contracted points lie in the world; those at infinity or beyond are very far.
+        """World positions of contracted points; those at infinity or beyond are very far.
 
-        Computed in float64, given as the points are.
+        Computed in float64, returned in the points' type.
         """
         if not self:
             return points
@@ -52,13 +52,13 @@ class Contraction:
         return (points + away * (1 / (held * (2 - held)) - 1)).to(points)
 
     def growth(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Times longer than in contracted space steps away from the centre are at world points."""
+        """Ratio, at world points, of a radial step in the world to that in contracted space."""
         return (self._away(points)[1] / self.radius)[..., 0].clamp(min=1).square()
 
     def balls(
         self, points: Float[Tensor, "*n 3"], radius: float
     ) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n"] | float]:
-        """Centres and radii of balls of the world that have all of balls in contracted space."""
+        """Centres and radii of balls of the world that contain balls of contracted space."""
         if not self:
             return points, radius
         middle = self.expanded(points)
@@ -71,4 +71,4 @@ class Contraction:
 
 
 UNCONTRACTED = Contraction()
-"""The world as it is."""
+"""No contraction."""

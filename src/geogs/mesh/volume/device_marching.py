@@ -13,7 +13,7 @@ from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
 
 _VOXELS = BLOCK**3
 _BATCH = 16384
-"""Blocks whose cells are looked at together."""
+"""Blocks whose cells are processed together."""
 
 
 @dataclass(frozen=True)
@@ -22,15 +22,15 @@ class _Cells:
 
     block: Int[Tensor, "c"]
     voxel: Int[Tensor, "c 3"]
-    """Their lowest voxel, in the block."""
+    """Lowest voxel of each, in the block."""
     case: Int[Tensor, "c"]
-    """Bit b says that corner b lies inside."""
+    """Bit b is set if corner b lies inside."""
 
 
 def device_surface(tsdf: SparseTsdf, min_weight: float) -> TensorMesh:
     """The zero level of a volume without a box, on its device.
 
-    What :func:`geogs.mesh.volume.level_set.extract_surface` gives, with vertices and faces in the
+    The same as :func:`geogs.mesh.volume.level_set.extract_surface`, with vertices and faces in the
     order of the volume's blocks.
     """
     above = _blocks_above(tsdf)
@@ -62,7 +62,7 @@ def _batches(above: Int[Tensor, "k 8"]) -> list[tuple[int, Int[Tensor, "b 8"]]]:
 def _passed(
     state: UInt8[Tensor, "k 8 8 8"], above: Int[Tensor, "b 8"], first: int
 ) -> tuple[Int[Tensor, "c"], Int[Tensor, "c"]]:
-    """Places among all voxels and cases of the cells of some blocks, from ``first`` on."""
+    """Indices among all voxels, and cases, of passed cells of some blocks, from ``first`` on."""
     around = _with_layers_above(state, above)
     case = torch.zeros((len(above), BLOCK, BLOCK, BLOCK), dtype=torch.uint8, device=state.device)
     is_seen = torch.full_like(case, 2)
@@ -91,7 +91,7 @@ def _with_layers_above(
 
 
 def _edges_of_triangles(cells: _Cells, above: Int[Tensor, "k 8"]) -> Int[Tensor, "m 3"]:
-    """The voxel edges of the vertices of each triangle: place of the lower voxel, and axis."""
+    """The voxel edges of the vertices of each triangle: index of the lower voxel, and axis."""
     device = above.device
     counts = torch.from_numpy(triangle_counts()).to(device).long()[cells.case]
     table = torch.from_numpy(triangle_table()).to(device).long()
@@ -107,7 +107,7 @@ def _edges_of_triangles(cells: _Cells, above: Int[Tensor, "k 8"]) -> Int[Tensor,
 def _place(
     block: Int[Tensor, "*v"], voxel: Int[Tensor, "*v 3"], above: Int[Tensor, "k 8"]
 ) -> Int[Tensor, "*v"]:
-    """Places among all voxels of those of a block, or one layer above it."""
+    """Indices, among all voxels, of those of a block or one layer above it."""
     beyond = voxel // BLOCK
     block = above[block, beyond[..., 0] + 2 * beyond[..., 1] + 4 * beyond[..., 2]]
     x, y, z = (voxel - beyond * BLOCK).unbind(-1)
@@ -117,7 +117,7 @@ def _place(
 def _positions(
     keys: Int[Tensor, "n"], tsdf: SparseTsdf, above: Int[Tensor, "k 8"]
 ) -> Float[Tensor, "n 3"]:
-    """Where the surface passes voxel edges."""
+    """Positions at which the surface passes voxel edges."""
     place, axis = keys // 3, keys % 3
     block = place // _VOXELS
     inner = torch.stack([place // BLOCK**2 % BLOCK, place // BLOCK % BLOCK, place % BLOCK], -1)

@@ -1,4 +1,4 @@
-"""Where nothing is: which voxels of a volume were seen to lie well before any surface."""
+"""Free space: the voxels of a volume that were seen to lie well in front of any surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from geogs.mesh.volume.tsdf import BLOCK, LIMIT, SparseTsdf, pack
 
 FREE = 0.5
-"""Fraction of the truncation; nearer to a surface than that may be its noise."""
+"""Least distance to a surface, as a fraction of the truncation; nearer may be its noise."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class FreeSpace:
     """A bit for every voxel of a volume, which takes a 64th of the volume's memory."""
 
     voxel: float
-    """Map units."""
+    """Side of a voxel, map units."""
     keys: Int[np.ndarray, "k"]
     """Keys of the blocks, ascending, as ``pack`` makes them."""
     bits: UInt8[np.ndarray, "k 64"]
@@ -43,7 +43,7 @@ class FreeSpace:
         return FreeSpace(parts[0].voxel, keys[order], bits[order])
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Whether the voxel nearest to each point is free; where there is none it is not."""
+        """Whether the voxel nearest to each point is free; false if there is none."""
         if not len(self.keys) or not len(points):
             return np.zeros(len(points), bool)
         block, inner, is_within = _nearest(points, self.voxel)
@@ -59,8 +59,8 @@ class FreeSpace:
 def _nearest(
     points: Float[np.ndarray, "n 3"], size: float
 ) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """Block of the voxel nearest to each point, clipped to what can be packed, the voxel's place in
-    the block, and whether a volume reaches so far."""
+    """Block of the voxel nearest to each point, clipped to the range of ``pack``, the voxel's
+    position in the block, and whether it is within a volume's reach."""
     voxel, limit = np.rint(points / size).astype(np.int64), LIMIT // BLOCK
     block = np.floor_divide(voxel, BLOCK)
     is_within = np.asarray((np.abs(voxel) < LIMIT).all(axis=1))

@@ -1,4 +1,4 @@
-"""From signed distances to triangles."""
+"""Extraction of triangles from signed distances."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class SurfacePart:
     """The surface in one chunk of the space."""
 
     chunk: tuple[int, int, int]
-    """Which of the chunks of :data:`CHUNK` blocks along a side."""
+    """Index of the chunk, of :data:`CHUNK` blocks along a side."""
     keys: Int[np.ndarray, "n"]
     """Key of the voxel edge on which each vertex lies; the same in every part that has it."""
     position: Float[np.ndarray, "n 3"]
@@ -35,9 +35,9 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float) -> TensorMesh:
     """Triangles of the zero level, in the world frame of ``tsdf``.
 
     Only cells whose eight voxels have at least ``min_weight`` give triangles: the far side of the
-    band, where distances end in voxels that nobody saw, is no surface. The space is worked
-    through in chunks of 128 voxels that share one layer; a vertex is identified by the voxel edge
-    it lies on, so chunks join without seams or double vertices.
+    band, where distances end in unseen voxels, is no surface. The space is processed in chunks of
+    128 voxels that share one layer; a vertex is identified by the voxel edge it lies on, so chunks
+    join without seams or double vertices.
 
     Method: marching cubes (Lorensen and Cline 1987), see :mod:`geogs.mesh.volume.marching`.
     """
@@ -60,7 +60,7 @@ def surface_parts(tsdf: SparseTsdf, min_weight: float) -> Iterator[SurfacePart]:
 
 
 def stitched(parts: Iterable[SurfacePart], voxel: float) -> TensorMesh:
-    """One mesh of the parts, which may come in any order and from several volumes."""
+    """Join the parts, which may come in any order and from several volumes, to one mesh."""
     ordered = sorted(parts, key=lambda part: part.chunk)
     if not ordered:
         return TensorMesh.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
@@ -78,7 +78,7 @@ class _VoxelChunk:
 
     chunk: tuple[int, int, int]
     origin: Int[np.ndarray, "3"]
-    """Its first voxel."""
+    """First voxel of the box."""
     distance: Float[np.ndarray, "x y z"]
     cell: Bool[np.ndarray, "x y z"]
     """True at a cell's upper corner if all its eight voxels were seen."""
@@ -98,7 +98,7 @@ def _chunks(tsdf: SparseTsdf) -> Iterator[tuple[Int[Tensor, "3"], Int[Tensor, "k
 def _voxel_chunk(
     tsdf: SparseTsdf, min_weight: float, chunk: Int[Tensor, "3"], member: Int[Tensor, "k"]
 ) -> _VoxelChunk | None:
-    """A box that has one voxel layer of the next ones; None without a cell or without a zero."""
+    """A box with one voxel layer of the next ones; None without a cell or without a zero."""
     blocks = tsdf.coordinates[member]
     first = blocks.amin(0)
     extent = blocks.amax(0) - first + 1
@@ -117,12 +117,12 @@ def _voxel_chunk(
 
 
 def least_weight(min_weight: float) -> float:
-    """The weight from which on a voxel was seen."""
+    """Least weight of a voxel that counts as seen."""
     return max(min_weight, 1e-6)
 
 
 def off_zero(distance: Float[Tensor, "*v"]) -> Float[Tensor, "*v"]:
-    """No value quite zero, so that a vertex lies strictly inside its edge."""
+    """Move values away from zero, so that a vertex lies strictly inside its edge."""
     away = distance.abs().clamp(min=_SMALLEST)
     return torch.where(distance < 0, -away, away)
 

@@ -16,7 +16,7 @@ CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])
 EDGES = np.array([[c, axis] for axis in range(3) for c in range(8) if not c >> axis & 1])
 """Edges of a cell: lower corner and axis."""
 MOST_TRIANGLES = 5
-"""Faces of a cell."""
+"""Most triangles of a cell."""
 
 Loop = list[int]
 """Edges of a cell that a piece of the surface passes in turn."""
@@ -48,13 +48,13 @@ def march(
 
 @cache
 def triangle_counts() -> Int8[np.ndarray, "256"]:
-    """Triangles of each case; bit c of a case says that corner c lies inside."""
+    """Number of triangles of each case; bit c of a case is set if corner c lies inside."""
     return np.array([len(triangles_of(case)) for case in range(256)], np.int8)
 
 
 @cache
 def triangle_table() -> Int8[np.ndarray, "256 t 3"]:
-    """Edges of the triangles of each case; what is not used is -1."""
+    """Edges of the triangles of each case; unused entries are -1."""
     table = np.full((256, MOST_TRIANGLES, 3), -1, np.int8)
     for case in range(256):
         for n, triangle in enumerate(triangles_of(case)):
@@ -100,9 +100,9 @@ def faces() -> list[list[int]]:
 
 
 def _fan(loop: Loop) -> list[tuple[int, int, int]]:
-    """Triangles of a loop, from where fewest of their inner edges lie in a face of the cell.
+    """Triangles of a loop, from the corner with fewest of their inner edges in a face of the cell.
 
-    One that does could meet one of the cell behind the face.
+    An edge in a face could meet one of the cell behind the face.
     """
     turns = [loop[k:] + loop[:k] for k in range(len(loop))]
     best = min(turns, key=lambda t: sum(_on_one_face(t[0], t[k]) for k in range(2, len(t) - 1)))

@@ -6,7 +6,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _case(distance, x, y, z):
-    """Which corners of the cell below an upper corner lie inside, as bits."""
+    """Bits of the corners, of the cell below an upper corner, that lie inside."""
     case = 0
     for c in range(8):
         if distance[x - 1 + (c & 1), y - 1 + (c >> 1 & 1), z - 1 + (c >> 2 & 1)] < 0:
@@ -16,7 +16,7 @@ def _case(distance, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_triangles(distance, seen, counts):
-    """Triangles of all cells that were seen."""
+    """Count the triangles of all cells that were seen."""
     total = 0
     for x in range(1, seen.shape[0]):
         for y in range(1, seen.shape[1]):
@@ -46,7 +46,7 @@ def _touches(seen, x, y, z, axis):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_vertices(distance, seen, number):
-    """Position and axis of the vertices; ``number`` gets the place of that of each edge."""
+    """Position and axis of the vertices; ``number`` receives the index of each edge's vertex."""
     found = 0
     room = 1024
     vertices = np.empty((room, 4), np.float64)

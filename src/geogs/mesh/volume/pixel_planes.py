@@ -1,7 +1,7 @@
 """The small plane that each pixel of a depth map shows, and its footprint.
 
 On a surface seen at a slant a footprint is longer than a voxel, and a distance along the ray is
-many times that from the surface. Both follow from how inverse depth goes on around a pixel.
+many times that from the surface. Both follow from the slopes of inverse depth around a pixel.
 """
 
 from dataclasses import dataclass, replace
@@ -16,17 +16,17 @@ from geogs.geometry.jumps import minmod_slopes
 from geogs.mesh.volume.contraction import Contraction
 
 LEAST_BAND = 0.5
-"""Fraction of the truncation that the band around a surface has along the normal at least, to
-either side: a surface needs a voxel behind it wherever it passes the grid."""
+"""Least width of the band on either side of a surface, along the normal, as a fraction of the
+truncation: a surface needs a voxel behind it wherever it passes the grid."""
 _LEAST_INCIDENCE = 0.01
-"""Nothing is taken for more slanted than that (89.4 degrees): it is a step that looks like one."""
+"""Least incidence (89.4 degrees): a surface that seems more slanted is a depth step."""
 _MOST_SAMPLES = 64
-"""Along the footprint of a pixel."""
+"""Most samples along the footprint of a pixel."""
 _GRAZING = 0.1
-"""Incidence (84 degrees) below which a depth counts less, by its square: of a road far ahead the
-upper ends of disks are seen, and all views before see it so."""
+"""Incidence (84 degrees) below which a depth's weight falls with its square: of a road far ahead
+the upper ends of disks are seen, by all earlier views alike."""
 _LEAST_WEIGHT = 0.1
-"""Part of its weight that it keeps."""
+"""Least fraction of its weight that it keeps."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class PixelPlanes:
     """Slope along v."""
     slant: tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]
     """Median of three pixels in a row of both slopes: a single pixel between two surfaces has a
-    slope, but none that its neighbours have."""
+    slope that its neighbours do not have."""
     valid: Bool[Tensor, "h w"]
-    """Where there is a depth."""
+    """Pixels with a depth."""
     camera: Camera
     growth: Float[Tensor, "h w"] | float = 1.0
-    """Times larger than it is given what is to be as long as voxels is there."""
+    """Factor at each pixel on lengths that follow the size of the voxels."""
 
     @staticmethod
     def of(
@@ -91,7 +91,7 @@ class PixelPlanes:
         (map units) apart or less.
 
         A pixel of a surface that faces the camera has one; one at a slant has more, up to 64, along
-        the way on which its depth changes most.
+        the direction in which its depth changes most.
         """
         valid, camera, device = self.valid, self.camera, self.inverse.device
         steepest = torch.maximum(*(slope.abs() for slope in self.slant))
@@ -110,8 +110,8 @@ class PixelPlanes:
 
     @cached_property
     def _incidence(self) -> Float[Tensor, "h w"]:
-        """Distance from the plane over that along the axis: where 1 / z = a x + b y + c on the
-        plane, (1 / z) / |(a, b, c)| on the ray (x, y, 1)."""
+        """Ratio of the distance from the plane to that along the axis: with 1 / z = a x + b y + c
+        on the plane, (1 / z) / |(a, b, c)| on the ray (x, y, 1)."""
         rays = self.camera.rays(self.inverse.dtype, self.inverse.device)
         a, b = self.slant[0] * self.camera.fx, self.slant[1] * self.camera.fy
         c = self.inverse - a * rays[..., 0] - b * rays[..., 1]
@@ -119,7 +119,7 @@ class PixelPlanes:
 
 
 def widest(truncation: float) -> float:
-    """The truncation along the axis of what is seen at the most slanted."""
+    """The truncation along the axis on the most slanted surface."""
     return truncation * max(1.0, LEAST_BAND / _LEAST_INCIDENCE)
 
 

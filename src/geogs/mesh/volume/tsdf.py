@@ -23,7 +23,7 @@ from geogs.threads import run_chunks, worker_count
 BLOCK = 8
 """Voxels along a side of a block."""
 LIMIT = 2**19
-"""Voxels have coordinates in [-LIMIT, LIMIT) along each axis; what lies farther is left out."""
+"""Voxels have coordinates in [-LIMIT, LIMIT) along each axis; others are left out."""
 BYTES_PER_BLOCK = BLOCK**3 * 2 * 4
 HALF = BLOCK // 2
 """Voxels along a side of half a block."""
@@ -39,7 +39,7 @@ class BlockBox:
 
     low: tuple[int, int, int]
     high: tuple[int, int, int]
-    """The first beyond it along each axis."""
+    """First block beyond it along each axis."""
 
 
 def pack(coordinates: Int[Tensor, "*n 3"]) -> Int[Tensor, "*n"]:
@@ -135,8 +135,8 @@ class SparseTsdf:
     ) -> None:
         """``voxel`` in map units, ``truncation`` in voxels.
 
-        With a ``box`` only its blocks are kept, and one layer beyond its upper sides, which cells
-        on these reach into; where a voxel is kept it is what it would be without the box.
+        With a ``box`` only its blocks are kept, and one layer beyond its upper sides, into which
+        cells on these reach; kept voxels are the same as without the box.
         """
         self.box = box
         self.voxel = voxel
@@ -172,14 +172,14 @@ class SparseTsdf:
         return self._weight[: len(self)].unflatten(1, (BLOCK, BLOCK, BLOCK))
 
     def owns(self, block: Int[Tensor, "*b 3"], layers: int = 0) -> Bool[Tensor, "*b"]:
-        """Whether blocks lie in the box or so many layers above it; all do where there is none."""
+        """Whether blocks lie in the box or ``layers`` layers above it; all do if there is none."""
         if self.box is None:
             return torch.ones(block.shape[:-1], dtype=torch.bool, device=block.device)
         low, high = (block.new_tensor(side) for side in (self.box.low, self.box.high))
         return ((block >= low) & (block < high + layers)).all(-1)
 
     def slots_of(self, blocks: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
-        """Places of blocks in :attr:`coordinates`, -1 where the volume has none."""
+        """Indices of blocks in :attr:`coordinates`, -1 where the volume has none."""
         if not len(self):
             return torch.full(blocks.shape[:-1], -1, device=self.device)
         keys = pack(blocks)
@@ -198,10 +198,10 @@ class SparseTsdf:
         Each pixel is a small plane, which is exact on flat surfaces at any slant and does not mix
         the two sides of a depth step. Every voxel of every block in view is updated up to one
         truncation behind the surface, so free space seen later clears what an earlier view put
-        there. In the farther half of that the weight falls to zero (Bylow et al. 2013), since what
-        is behind one view's silhouette is often in front of another's surface. Distances, and the
-        truncation, are along the optical axis; at a slant that is wider (``PixelPlanes``), and
-        where space is contracted it grows as voxels do.
+        there. In the farther half of that the weight falls to zero (Bylow et al. 2013), since space
+        behind one view's silhouette is often in front of another's surface. Distances, and the
+        truncation, are along the optical axis; the truncation is wider on slanted surfaces
+        (``PixelPlanes``), and grows with the voxels where space is contracted.
         """
         depth = depth.to(self.device, torch.float32)
         weight = weight.to(self.device, torch.float32)

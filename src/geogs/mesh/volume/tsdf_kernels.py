@@ -14,8 +14,8 @@ def average_in(
     """Update the voxels of some blocks (k,) of ``distance`` and ``weight`` (blocks, voxels).
 
     ``block`` (k, 3) and ``local`` (3, voxels) add up to a voxel's u z, v z and z in the image;
-    ``corner`` (k, 3) and ``step`` (3, voxels) to where it lies from the centre of a ``Contraction``
-    with a ``radius``, which may be infinite, and which is at ``middle`` (3) as the former are.
+    ``corner`` (k, 3) and ``step`` (3, voxels) to its position from the centre of a ``Contraction``
+    with a ``radius``, which may be infinite; ``middle`` (3) has u z, v z and z of that centre.
     ``table`` (pixels, 4) and ``truncation`` (pixels), in map units, are those of ``PixelPlanes``.
     """
     is_contracted = np.isfinite(radius)

@@ -96,8 +96,8 @@ def list_disks(
 ):
     """Fill the lists of the tiles in rows first_row..last_row, nearest disk first.
 
-    ``cursor`` holds where each tile's next entry goes: its disk to ``lists``, its runs to ``runs``.
-    ``entries`` tells for every pair which entry it became: one past the last where there is none.
+    ``cursor`` is the index of each tile's next entry: its disk goes to ``lists``, its runs to
+    ``runs``. ``entries`` receives the entry of every pair: one past the last where there is none.
     """
     none = lists.shape[0]
     for k in range(order.shape[0]):

@@ -33,12 +33,12 @@ BLEND_PLANES = 12
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 CHECK_EVERY = 16
-"""List entries after which the runs worth visiting are looked up again."""
+"""List entries after which the runs worth visiting are determined again."""
 
 
 @numba.njit(**_PART)
 def reference_depth(records, lists, first, last):
-    """Depth from which a tile's sums are measured, to keep their digits: the middle disk's."""
+    """Origin of the depths in a tile's sums, to keep their digits: the middle disk's depth."""
     return ONE / records[lists[(first + last) // 2], at.WC]
 
 
@@ -53,9 +53,9 @@ def common_runs(runs, k, first_run, last_run):
 def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
     """Blend one disk into the runs first..last of a tile; returns the sum of its weights.
 
-    A pixel's light is the transmittance, and turns negative when blending stops. In two loops: of
-    one, each pixel would have so long a chain of results to wait for that the processor would wait,
-    too.
+    A pixel's light is the transmittance, and becomes negative when blending stops. There are two
+    loops, because in one the long chain of dependent results of each pixel would stall the
+    processor.
     """
     mx, my, opacity, wc = r[at.MX], r[at.MY], r[at.OPACITY], r[at.WC]
     ux, uy, vx, vy, wx, wy = r[at.UX], r[at.UY], r[at.VX], r[at.VY], r[at.WX], r[at.WY]
@@ -110,7 +110,7 @@ def live_runs(state):
 
 @numba.njit(**_PART)
 def clear_state(state, left, top, width, height):
-    """Untouched pixels with full light; those outside the image take none."""
+    """Set pixels to full light; those outside the image take none."""
     state[:] = ZERO
     for row in range(TILE_HEIGHT):
         for col in range(TILE_WIDTH):
@@ -121,7 +121,7 @@ def clear_state(state, left, top, width, height):
 
 @numba.njit(**_PART)
 def write_maps(state, left, top, z_reference, depth, normal, alpha, distortion, median_depth):
-    """A tile's state into the image."""
+    """Write a tile's state into the image."""
     height, width = depth.shape
     for y in range(top, min(top + TILE_HEIGHT, height)):
         for x in range(left, min(left + TILE_WIDTH, width)):
@@ -144,8 +144,8 @@ def blend_tiles(
 ):  # fmt: skip
     """Render the tiles first_tile..last_tile; ``state`` is scratch of BLEND_PLANES planes.
 
-    ``saved`` (tiles, SAVED, TILE_PIXELS) receives what the backward pass starts from; give it no
-    tiles if there will be none. ``visible`` is only ever set.
+    ``saved`` (tiles, SAVED, TILE_PIXELS) receives the start of the backward pass; give it no tiles
+    if there is no backward pass. ``visible`` is only ever set.
     """
     height, width = depth.shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH

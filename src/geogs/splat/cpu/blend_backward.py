@@ -35,7 +35,7 @@ _RUNS = TILE_PIXELS // LANES
 
 @numba.njit(**_PART)
 def meet_disk(state, first, last, r, rank, inverse_near):
-    """Where one disk is seen by the runs first..last of a tile, as the forward pass has it.
+    """Intersect one disk with the runs first..last of a tile, as the forward pass does.
 
     Per pixel: ALPHA, 0 where it was not blended; DEPTH; FREE_DEPTH, the same where it follows the
     plane and else 0; and where the Gaussian is that of the plane, z u in U, z v in V and z rho in
@@ -77,8 +77,8 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         dL/dw = 2 |q| + 2 sum_{i behind} w_i s_i (z_i - z),
         dL/dz = 2 w (s A - sum_{i behind} w_i s_i).
 
-    In two loops: of one, each pixel would have so long a chain of results to wait for that the
-    processor would wait, too.
+    There are two loops, because in one the long chain of dependent results of each pixel would
+    stall the processor.
     """
     meet_disk(state, first, last, r, rank, inverse_near)
     mx, my, opacity = r[at.MX], r[at.MY], r[at.OPACITY]
@@ -138,7 +138,7 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
 
 @numba.njit(**_PART)
 def load_state(state, saved, left, top, d_depth, d_normal, d_alpha, d_distortion):
-    """A tile's final state and the losses' gradients of its maps.
+    """Load a tile's final state and the gradients of the loss with respect to its maps.
 
     Depth is Z / A, so dL/dw_i collects d_depth / A (z_i - depth); the part without z_i and d_alpha
     make D_CONSTANT.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 
-# Beyond the image's border, for the low-pass filter of the renderer.
+# Margin around the image, for the low-pass filter of the renderer.
 _BORDER_PIXELS = 8.0
 
 
@@ -18,7 +18,7 @@ def disks_in_view(
     T_cw: Float[Tensor, "v 4 4"],
     camera: Camera,
 ) -> Bool[Tensor, "n"]:
-    """Balls (centre, radius) that reach into the view frustum of at least one camera, or nearly so.
+    """Whether balls (centre, radius) reach into at least one camera's view frustum, or nearly so.
 
     True for balls whose numbers are not finite. For tensors on the CPU.
     """

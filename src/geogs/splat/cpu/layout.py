@@ -1,6 +1,6 @@
 """Layouts, constants, compiler options and an exponential, shared by the kernels.
 
-A disk's *record* holds what a pixel needs to know about it, in float32. With (dx, dy) the pixel's
+A disk's *record* holds the data of it that a pixel needs, in float32. With (dx, dy) the pixel's
 offset from the projected centre, the plane's inverse depth is w = Wx dx + Wy dy + Wc and the hit's
 coordinates on the disk are (Ux dx + Uy dy, Vx dx + Vy dy) / w, in units of sqrt(2) deviations, so
 that the Gaussian is exp(-min(u^2 + v^2, dx^2 + dy^2)).
@@ -90,7 +90,7 @@ _C3, _C4, _C5 = np.float32(-0.1664003761), np.float32(0.0406455346), np.float32(
 
 @numba.njit(inline="always", error_model="numpy", fastmath=PER_PIXEL["fastmath"])
 def exp_minus(x):
-    """exp(-x) of a float32 x >= 0 to 3e-6 of itself, and exp(-8) < MIN_ALPHA beyond 8.
+    """exp(-x) of a float32 x >= 0 with relative error 3e-6, and exp(-8) < MIN_ALPHA beyond 8.
 
     (exp(-x / 16))^16 by a polynomial; a library's exp is a call and would keep loops scalar.
     """

@@ -22,8 +22,8 @@ def rendered(
 ) -> tuple[tuple[Tensor, ...], Backward]:
     """Maps of one pose, as in ``RenderOutput``, and their backward pass.
 
-    It takes the gradients of depth, normal, alpha and distortion, None for zero, and gives those of
-    the disks and, float64, of the pose. It may be called again, but not without trace.
+    The backward pass takes the gradients of depth, normal, alpha and distortion, None for zero, and
+    returns those of the disks and, float64, of the pose. It may be called again, not without trace.
     """
     x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
     pose, threads = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy(), worker_count()

@@ -1,4 +1,4 @@
-"""Disks into the camera: one record and one box of pixels each, and the way back.
+"""Projection of disks into the camera: one record and one box of pixels each.
 
 The arithmetic is float64 (disks are few compared with pixels), so that disks seen edge-on keep
 their digits. Vectors are tuples of three floats.
@@ -93,13 +93,13 @@ def pixel_range(low, high, count):
 
 @numba.njit(**_PART)
 def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
-    """Where the disk can have at least ``MIN_ALPHA``; false if that has no bounds.
+    """Bound the pixels where the disk can have at least ``MIN_ALPHA``; false if there is no bound.
 
     ``u`` and ``v`` are the scaled tangents in the camera. The radius in deviations follows from the
     opacity. On the disk's plane it is an ellipse in the image: the dual conic of the circle, about
     the projected centre, M diag(r^2, r^2, -1) M^T with M = K [u v c]. Around the projected centre
     it is the circle of the low-pass Gaussian. A disk that reaches behind the camera has no bounds:
-    an endless circle stands for it.
+    its circle is infinite.
     """
     fx, fy = intrinsics[0], intrinsics[1]
     radius2 = 2 * math.log(opacity / MIN_ALPHA)

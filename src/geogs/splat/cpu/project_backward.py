@@ -1,4 +1,4 @@
-"""From the pixels' gradients of the records to those of the parameters and the pose."""
+"""Backward projection: from gradients of the records to those of the parameters and the pose."""
 
 import math
 
@@ -36,7 +36,7 @@ def add_outer(matrix, a, b):
 
 @numba.njit(**_PART)
 def quaternion_gradient(q, inverse_norm, a, b, n):
-    """Through the rotation matrix, given the gradients of its columns, and the normalisation."""
+    """Gradient of the quaternion, given those of the columns of the rotation matrix."""
     w, x, y, z = q
     gw = x * (b[2] - n[1]) + y * (n[0] - a[2]) + z * (a[1] - b[0])
     gx = -2 * x * (b[1] + n[2]) + y * (b[0] + a[1]) + z * (n[0] + a[2]) + w * (b[2] - n[1])
@@ -98,7 +98,7 @@ def record_backward(record, g, axes, c, ku, kv, intrinsics):
 @numba.njit(**PER_DISK)
 def sum_pairs(slots, entries, gradients, start, stop, sums):
     """Sum the gradients of the pairs of each of the disks start..stop, always in the same order."""
-    # Of a width known only at run time a loop is vectorised; of a constant one, unrolled instead.
+    # A loop of a width known only at run time is vectorised; one of a constant width is unrolled.
     width = sums.shape[1]
     for i in range(start, stop):
         for k in range(width):
@@ -114,7 +114,7 @@ def project_disks_backward(
     position, quaternion, log_scale, T, intrinsics, records, slots, sums, start, stop,
     d_position, d_quaternion, d_log_scale, d_opacity_logit, d_T,
 ):  # fmt: skip
-    """Gradients of disks start..stop, and this range's share of the (3, 4) pose gradient."""
+    """Gradients of disks start..stop, and this range's part of the (3, 4) pose gradient."""
     for i in range(start, stop):
         if slots[i] == slots[i + 1]:
             d_position[i, :] = 0

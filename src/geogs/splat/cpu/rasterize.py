@@ -24,7 +24,7 @@ from geogs.splat.cpu.project_backward import project_disks_backward, sum_pairs
 from geogs.threads import run_chunks
 
 # More chunks than threads, so that threads finish together; neighbouring tiles share a chunk, and
-# with it the disks in the cache. One thread has nobody to wait for.
+# with it the disks in the cache. One thread waits for no other.
 _TILE_CHUNKS_PER_THREAD = 16
 # The pose gradient is summed per chunk, then over chunks: their number must not depend on threads.
 _DISK_CHUNKS = 8
@@ -40,16 +40,15 @@ class TileLists:
     """The disks of each tile, nearest first."""
 
     offsets: np.ndarray
-    """(tiles + 1,) where each tile's entries start."""
+    """(tiles + 1,) index of each tile's first entry."""
     disks: np.ndarray
     """(entries,) index of the disk."""
     runs: np.ndarray
     """(entries, 2) runs of the tile's pixels that the disk may reach."""
     slots: np.ndarray
-    """(n + 1,) where each disk's pairs start."""
+    """(n + 1,) index of each disk's first pair."""
     entries: np.ndarray
-    """(pairs,) the entry that a pair became; the number of entries where the disk misses the
-    tile."""
+    """(pairs,) the entry of each pair; the number of entries where the disk misses the tile."""
 
 
 @dataclass(slots=True)

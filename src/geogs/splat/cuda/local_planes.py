@@ -16,8 +16,8 @@ def principal_planes(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Normal, tangent, planarity and spacing of each neighbourhood; see ``LocalPlane``.
 
-    ``neighbours`` are indices (int64) of ``points`` (float32), nearest first and the point itself
-    among them in front. Worked out in float64: Jacobi's method on the 3 x 3 scatter matrices.
+    ``neighbours`` are indices (int64) of ``points`` (float32), nearest first, beginning with the
+    point itself. Computed in float64: Jacobi's method on the 3 x 3 scatter matrices.
     """
     n, k = neighbours.shape
     normal, tangent = points.new_empty(n, 3), points.new_empty(n, 3)

@@ -21,7 +21,7 @@ _KEPT = 4
 
 @dataclass(frozen=True)
 class _Key:
-    """Properties of a rendering by which its buffers can be used again."""
+    """Properties of a rendering that decide whether its buffers can be used again."""
 
     disks: int
     views: int
@@ -70,7 +70,7 @@ class Loan:
 
 @functools.cache
 def _pool() -> RasterizerPool:
-    """The process's rasterizers."""
+    """The process's pool of rasterizers."""
     return RasterizerPool()
 
 
@@ -84,12 +84,12 @@ def rendered(
     """Maps of one pose or of several, as in ``RenderOutput``, on the GPU that holds the disks, and
     their backward pass.
 
-    It takes the gradients of depth, normal (components last), alpha and distortion, None for zero,
-    but not all None, and gives those of the disks and, float64 on their device, of the poses. It
-    may be called again, but not without trace; it keeps its rasterizer as long as it exists.
+    The backward pass takes the gradients of depth, normal (components last), alpha and distortion,
+    None for zero, but not all None. It returns those of the disks and, float64 on their device, of
+    the poses. It may be called again, not without trace; it keeps its rasterizer while it exists.
 
     The compositing is launched before it is known whether the list entries fit, and once more if
-    they do not: that is known as soon as the projection is done, while the GPU goes on.
+    they do not: that is known as soon as the projection is done, while the GPU continues.
     """
     device, n = disks.position.device, len(disks.position)
     disks = DiskParameters(*(p.detach().contiguous() for p in disks))

@@ -17,30 +17,30 @@ THREADS = 256
 RECORD, OUTLINE, SUMS, POSE_COPIES = 16, 8, 16, 32
 """Floats per disk of the record, of the outline and of the pixels' sums; see the sources."""
 _ENTRIES_PER_DISK = 4
-"""Tiles that a disk reaches in a view, usually fewer; what the lists have room for at first."""
+"""Initial room in the lists: tiles that a disk reaches in a view, usually fewer."""
 _SLACK = 1.25
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """Where the disks are seen from, and how many disks there are."""
+    """Poses from which the disks are seen, and the number of disks."""
 
     poses: Float[Tensor, "s *k"]
     """World to camera, float64, (s, 3, 4) or (s, 4, 4)."""
     batch: Int[Tensor, "b"] | None = None
-    """Which of the poses, int32 on the device; negative for none. All in order if not given."""
+    """Indices of the poses, int32 on the device; negative for none. By default all in order."""
     count: Int[Tensor, "1"] | None = None
-    """Number of disks, int32 on the device; all that the parameters have room for if not given."""
+    """Number of disks, int32 on the device; by default all that the parameters have room for."""
 
     @property
     def pose_size(self) -> int:
-        """Numbers from one pose to the next."""
+        """Count of numbers from one pose to the next."""
         return self.poses.stride(0)
 
 
 @dataclass(slots=True)
 class Maps:
-    """What :class:`geogs.splat.render.RenderOutput` holds, normals with components in front."""
+    """Maps of :class:`geogs.splat.render.RenderOutput`, normals with components in front."""
 
     depth: Float[Tensor, "*b h w"]
     normal: Float[Tensor, "*b 3 h w"]
@@ -95,7 +95,7 @@ class Rasterizer:
         tiles, pixels = views * self._tiles, views * camera.height * camera.width
         counts = torch.zeros(2 + tiles, dtype=torch.int32, device=device)
         self.status, self._counts = counts[:2], counts[2:]
-        """Most entries of any pass so far; 1 once there were more than room for them."""
+        """Status: most entries of any pass so far; 1 once there was no room for all of them."""
         places = torch.empty(2 * tiles + 1, dtype=torch.int32, device=device)
         self._offsets, self._cursor = places[: tiles + 1], places[tiles + 1 :]
         self._records = torch.empty(views, capacity, RECORD, device=device)
@@ -114,18 +114,18 @@ class Rasterizer:
 
     @property
     def room(self) -> int:
-        """How many entries (a disk in a tile of a view) there is room for."""
+        """Number of entries (a disk in a tile of a view) that there is room for."""
         return len(self._disks)
 
     def reserve(self, entries: int) -> None:
-        """Make room for so many entries in all."""
+        """Make room for ``entries`` in all."""
         if entries > self.room:
             room = int(_SLACK * entries)
             self._keys = torch.empty(room, dtype=torch.int64, device=self.device)
             self._disks = torch.empty(room, dtype=torch.int32, device=self.device)
 
     def project(self, disks: DiskParameters, views: Views, maps: Maps) -> None:
-        """Records, outlines and the number of entries of each tile; clears what is visible."""
+        """Compute records, outlines and the number of entries of each tile; clear ``visible``."""
         c = self.camera
         self._kernels["project_disks"](
             (self._blocks, self.views), THREADS, self.capacity, views.count, *disks, views.poses,
@@ -138,7 +138,7 @@ class Rasterizer:
         )  # fmt: skip
 
     def note_projection(self) -> None:
-        """Let :meth:`has_room` wait for what was launched so far and no longer."""
+        """Let :meth:`has_room` wait only for the work launched so far."""
         if self._counted is not None:
             self._counted.record(torch.cuda.current_stream(self.device))
 
@@ -176,7 +176,7 @@ class Rasterizer:
         d_disks: DiskParameters | None,
         d_poses: Float[Tensor, "b 4 4"] | None,
     ) -> None:
-        """Write the gradients of the disks and of the poses (float64), where they are asked for."""
+        """Write the gradients of the disks and of the poses (float64), each unless it is None."""
         c, d = self.camera, gradients
         strides = (1, c.width * c.height) if d.normal_is_planar else (3, 1)
         self._kernels["unblend_tiles"](

@@ -1,1 +1,1 @@
-"""Self-calibration: focal length and distortion, out of the video itself."""
+"""Self-calibration: focal length and distortion, estimated from the video itself."""

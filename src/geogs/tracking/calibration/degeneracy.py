@@ -1,4 +1,4 @@
-"""Motion and scenes that do not tell the focal length: seen in the flow, without any camera.
+"""Detection of motions and scenes that do not determine the focal length, from flow alone.
 
 A camera that only rotates, or that looks at a plane, moves its image by a homography. A general
 scene under translation does not.
@@ -22,18 +22,18 @@ MAX_COST = 1.5
 1.0 where it is about right (docs/notebook/calibration.md)."""
 MAX_RESIDUAL = 1.0
 """Median residual of a match, in its deviations, above which no camera explains all pairs: 0.3 to
-0.75 where the lens comes out right, people over a third of what is seen or not, of which the mean
-tells nothing (docs/notebook/calibration.md)."""
+0.75 where the estimated lens is right, even with people over a third of the view, for which the
+mean fails (docs/notebook/calibration.md)."""
 PLANAR_FRACTION = 0.9
-"""Where one homography explains this fraction of the matches in all views, they show a plane."""
+"""Fraction of the matches, in all views, explained by a homography, above which a plane is seen."""
 _TOLERANCE = 1 / 1000
-"""Deviation, of the long edge, from a homography that is still explained by it."""
+"""Largest deviation from a homography, as a fraction of the long edge."""
 _FIELDS_OF_VIEW = 25.0, 130.0
-"""Degrees along the longer side, between which a rotation is looked for."""
+"""Search range of the field of view of a rotating camera, degrees along the longer side."""
 
 
 class Degeneracy(Enum):
-    """Why the flow cannot tell the focal length."""
+    """Reasons why the flow does not determine the focal length."""
 
     BLANK = "no frame has enough texture"
     STILL = "the camera hardly moves"
@@ -44,21 +44,21 @@ class Degeneracy(Enum):
 
 @dataclass(frozen=True)
 class _HomographyFit:
-    """The homography that explains the flow from one view to another best."""
+    """Homography that fits the flow from one view to another best."""
 
     H: Float[np.ndarray, "3 3"]
     explained: float
-    """Fraction of the matches."""
+    """Fraction of the matches that it explains."""
     first: Float[np.ndarray, "n 2"]
     """Pixels of the matches."""
     second: Float[np.ndarray, "n 2"]
 
 
 def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Degeneracy | None:
-    """What is wrong with the flow from one view to others; None if nothing is.
+    """Detect a degeneracy of the flow from one view to others; None if there is none.
 
-    A rotation that only one focal length explains tells it, however little else there is.
-    ``min_parallax`` is in pixels; of the camera only size, aspect and principal point count.
+    A rotation that only one focal length explains determines it, even without parallax.
+    ``min_parallax`` is in pixels; of the camera only size, aspect and principal point are used.
     """
     fits = [fit for fit in (_homography(camera, match) for match in flows) if fit is not None]
     if not fits:
@@ -67,7 +67,7 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
         return None
 
     def left(angle: float) -> float:
-        """What rotation leaves, in the view where that is most, in pixels."""
+        """Return the largest residual of a rotation over the views, in pixels."""
         K = camera.with_field_of_view(angle).matrix().numpy()
         return max(_unexplained(K, fit) for fit in fits)
 
@@ -78,7 +78,7 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
 
 
 def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:
-    """The homography of one view (MAGSAC); None where it has too few matches."""
+    """Fit the homography of one view (MAGSAC); None where it has too few matches."""
     match, tolerance = match.on_cpu(), camera.long_edge * _TOLERANCE
     used = match.sure()[0].numpy()
     if used.sum() < 50:
@@ -93,7 +93,7 @@ def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:
 
 
 def _unexplained(K: Float[np.ndarray, "3 3"], fit: _HomographyFit) -> float:
-    """Median distance of matches from where the rotation nearest to a homography moves them."""
+    """Return the median residual of matches for the rotation nearest to a homography."""
     R = nearest_rotation(np.linalg.inv(K) @ fit.H @ K)
     moved = _moved(K @ R @ np.linalg.inv(K), fit.first)
     return float(np.median(np.linalg.norm(moved - fit.second, axis=1)))

@@ -1,10 +1,10 @@
-"""A first focal length: several lenses tried on the same flows from one keyframe.
+"""Initial focal length: several lenses tried on the same flows from one keyframe.
 
-Flow needs no focal length, so it is measured once. Every candidate places the keyframes by the
-essential matrix and PnP and is adjusted, the focal length with the rest, at last the distortion,
-too: of a lens that bends, pinholes of different focal lengths are all about as wrong, and from none
-of them the adjustment may come to a barrel, which is tried for itself. The least cost wins, with
-what a bend of the lens costs by itself.
+Flow needs no focal length, so it is measured once. For every candidate the keyframes are located by
+the essential matrix and PnP and adjusted together with the focal length, and at last the
+distortion: for a distorted lens pinholes of all focal lengths fit about equally badly, and the
+adjustment may not get from any of them to barrel distortion, which is tried separately. The least
+cost, with a penalty on distortion, wins.
 """
 
 from dataclasses import dataclass, replace
@@ -26,38 +26,38 @@ from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
-"""Degrees along the longer side, besides that of the guess."""
+"""Candidate fields of view besides the guess, degrees along the longer side."""
 BARREL, OF_BARREL = (-0.2, 0.03), 70.0
-"""k1 and k2 of a wide camera's lens, and a field of view of one."""
+"""k1 and k2 of a typical wide-angle lens, and its field of view."""
 BEND_COST = 0.002
-"""Cost that is added for a lens that bends by one usual deviation. Matches err alike, so that costs
-a few per cent apart tell little: from half of this on the wrong minimum of a turn does not win."""
+"""Penalty of a distortion of one prior deviation. Errors of matches are correlated, so costs that
+differ by a few per cent mean little: above half of this the wrong minimum of a rotation loses."""
 _STAGES = (30.0, 10), (10.0, 10), (3.0, 30)
-"""Huber's limit, and steps at most. Those of the last are many, as from a pinhole to the lens leads
-a long valley; whoever stops in it may take the wrong one for the best."""
+"""Huber threshold and most steps of each stage. The last has many, as a long valley leads from a
+pinhole to the lens; if it stops there, the wrong candidate may win."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Keyframes placed by one candidate; on the CPU."""
+    """Keyframes located with one candidate; on the CPU."""
 
     lens: Camera
     T_cw: Float[Tensor, "n 4 4"]
     inverse_depth: Float[Tensor, "p"]
-    """On the cells of the first keyframe."""
+    """Inverse depth of the first keyframe's cells."""
     information: Float[Tensor, "p"]
     cost: float
 
     @property
     def penalised(self) -> float:
-        """The cost with what is known of any lens: of two minima that explain a turn about as well
-        it tells the one that bends as lenses do."""
+        """Cost with the prior on distortion: of two minima that fit a rotation about equally it
+        selects the one with a plausible lens."""
         bends = zip((self.lens.k1, self.lens.k2), USUAL_BEND, strict=True)
         return self.cost + BEND_COST * sum((k / usual) ** 2 for k, usual in bends)
 
 
 def candidates(camera: Camera, unknowns: Unknowns) -> list[Camera]:
-    """The guess, and where it may be wrong pinholes of other fields of view, and barrels."""
+    """Return the guess and, if it is uncertain, pinholes and barrels of other fields of view."""
     if not unknowns.focal:
         return [camera]
     guess = camera.with_focal(camera.fx)
@@ -69,8 +69,8 @@ def candidates(camera: Camera, unknowns: Unknowns) -> list[Camera]:
 def try_candidate(
     lens: Camera, flows: list[FlowMatch], min_parallax: float, unknowns: Unknowns
 ) -> Start | None:
-    """Place the keyframes by the pinhole of a lens and adjust them from there, at last with k1 and
-    k2 where these are unknown; None where it shows no parallax."""
+    """Locate the keyframes with the pinhole of a lens and adjust them, at last with k1 and k2 if
+    these are unknown; None if there is no parallax."""
     camera, flows = lens.pinhole, [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view(camera, flows[1::2], min_parallax)
@@ -101,7 +101,7 @@ def try_candidate(
 
 
 def _adjusted(problem: BundleProblem, block: LensBlock, radial: bool) -> SharedResult | None:
-    """The problem adjusted from forgiving to strict, in the end with k1 and k2 if ``radial``."""
+    """Adjust the problem from tolerant to strict, at the end with k1 and k2 if ``radial``."""
     result = None
     for huber, steps in _STAGES:
         block = replace(block, radial=radial and huber == _STAGES[-1][0])

@@ -1,4 +1,4 @@
-"""Focal length and distortion by one stretch of a video, with their deviations."""
+"""Focal length and distortion estimated from one stretch of a video, with standard deviations."""
 
 import math
 from dataclasses import dataclass
@@ -17,30 +17,30 @@ from geogs.tracking.calibration.growing_bundle import GrowingBundle
 from geogs.tracking.calibration.unknowns import Unknowns
 
 LEAST_DEVIATION = 0.002
-"""Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
+"""Least deviation of the focal length, relative, and of k1 and k2, however many matches agree."""
 MOST_BEND = 4.0
-"""Usual deviations of k1 and k2 beyond which matches tell of no lens, but of nothing at all."""
+"""Prior deviations of k1 and k2 beyond which an estimate is rejected as no real lens."""
 UNRELIABLE = 0.1
-"""Relative deviation above which the focal length is not believed and the guess is kept, which may
-be as good."""
+"""Relative deviation above which the focal length is rejected and the guess, which may be as good,
+is kept."""
 FIELDS_OF_VIEW = 15.0, 150.0
-"""Degrees along the longer side; what lies outside is no pinhole camera's."""
+"""Accepted range of a pinhole camera's field of view, degrees along the longer side."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The lens by one stretch."""
+    """Lens estimated from one stretch."""
 
     lens: Camera
     covariance: Float64[Tensor, "3 3"]
     """Covariance of log focal length, k1 and k2; zero for those that are known."""
     keyframes: int
     readout: FoundReadout | None = None
-    """None where it was not asked for, or images are too far apart to show it."""
+    """None where it was not estimated, or images are too far apart to show it."""
 
     @property
     def deviations(self) -> tuple[float, float, float]:
-        """Standard deviation of each of these."""
+        """Standard deviation of each of the three."""
         focal, k1, k2 = self.covariance.diagonal().sqrt().tolist()
         return focal, k1, k2
 
@@ -51,7 +51,7 @@ class Estimate:
 
 
 def estimate(bundle: GrowingBundle, unknowns: Unknowns) -> Estimate | str:
-    """Estimate by an adjusted stretch, or why it is not believed."""
+    """Return the estimate from an adjusted stretch, or why it is rejected."""
     result = bundle.result
     assert result is not None
     lens = result.block.lens
@@ -76,8 +76,8 @@ def estimate(bundle: GrowingBundle, unknowns: Unknowns) -> Estimate | str:
 
 
 def with_prior(said: Estimate) -> Estimate:
-    """The estimate joined with what is known of any lens: k1 and k2 are about zero, which a narrow
-    field of view does not tell."""
+    """Combine an estimate with the prior that k1 and k2 are about zero, as a narrow field of view
+    does not determine them."""
     lens = said.lens
     size = torch.tensor([0.0, lens.k1, lens.k2], dtype=torch.float64)
     told = LensEstimate(size, said.covariance)

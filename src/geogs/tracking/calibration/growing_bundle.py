@@ -1,4 +1,4 @@
-"""Keyframes with poses, inverse depths and flow around a lens that still changes."""
+"""Keyframes with poses, inverse depths and flow, adjusted together with the lens."""
 
 import math
 from collections.abc import Callable
@@ -22,14 +22,14 @@ from geogs.tracking.matching.pnp import pnp
 from geogs.world.grid import SampleGrid
 
 OFFSETS = (1, 3, 6)
-"""Every keyframe is matched with those so many before it."""
+"""Offsets to the preceding keyframes that each is matched with."""
 _STALE = 0.3
-"""Pixels of median motion of the reprojection after which a pair is matched again."""
+"""Median motion of the reprojection, in pixels, after which a pair is matched again."""
 _TOGETHER = 16
-"""Pairs that are matched in one go."""
+"""Pairs matched at a time."""
 PATIENT, LEAST_DECREASE = replace(OPTIONS, iterations=60), 1e-6
-"""Of a turning camera focal length, bend and depths lie in one flat valley, along which each step
-gains little: whoever stops early stops where he began."""
+"""Options for many small steps: for a rotating camera focal length, distortion and depths lie in a
+flat valley, along which each step gains little; an early stop would be near the start."""
 
 
 @dataclass
@@ -41,7 +41,7 @@ class _Edge:
 
 
 class GrowingBundle:
-    """Views placed so far, and the edges between them; mutable. Poses are on the CPU."""
+    """Views located so far, and the edges between them; mutable. Poses are on the CPU."""
 
     def __init__(
         self,
@@ -52,14 +52,14 @@ class GrowingBundle:
         unknowns: Unknowns,
         rows: OpenRows | None = None,
     ) -> None:
-        """The views that a candidate has placed, with the depth of the first one; ``rows`` where
-        they may not all be seen at once."""
+        """Start from views that a candidate has located, with the depth of the first one; ``rows``
+        for a rolling shutter."""
         self.grid = grid
-        """Grid of the guess: of its camera nothing but the size is used."""
+        """Grid of the guess; of its camera only the size is used."""
         self._operator, self._unknowns, self._rows = operator, unknowns, rows
         self.lens = start.lens
         self.readout = (rows and rows.readout) or 0.0
-        """Seconds."""
+        """Present readout, seconds."""
         self._views = views[: len(start.T_cw)]
         known = start.information.to(grid.device)
         first = grid_fields(grid).fill(start.inverse_depth.to(grid.device), known)
@@ -77,7 +77,7 @@ class GrowingBundle:
 
     @property
     def _pinhole(self) -> SampleGrid:
-        """The grid of the present focal length."""
+        """Grid of the present focal length."""
         return SampleGrid(self.lens.pinhole, self.grid.device)
 
     def place(self, view: View) -> bool:
@@ -132,7 +132,7 @@ class GrowingBundle:
         return block.project(torch.stack(self._T), source, target, depth).pixels
 
     def problem(self) -> BundleProblem:
-        """All edges, on the CPU; every pose but the first is free."""
+        """Return the problem of all edges, on the CPU; every pose but the first is free."""
         directed = sorted(self._edges)
         edges = [self._edges[e] for e in directed]
         free = torch.arange(len(self)) > 0
@@ -148,7 +148,7 @@ class GrowingBundle:
         )
 
     def adjust(self) -> bool:
-        """Solve for everything and take it over; False if that fails."""
+        """Solve for all unknowns and update the state; False if that fails."""
         problem, asked = self.problem(), self._unknowns
         block = LensBlock(
             self.lens, self.grid.pixels.cpu(), asked.focal, asked.radial,
@@ -168,8 +168,8 @@ class GrowingBundle:
         return True
 
     def _motions(self, inverse_depth: Float[Tensor, "n p"]) -> RowMotions | None:
-        """How views move while they are read, by the images beside them; none where all rows are
-        seen at once, or none of these images is near enough to tell."""
+        """Return the motions of views during readout, by the images next to them; None for a global
+        shutter, or where none of these images is near enough."""
         if self._rows is None:
             return None
         velocity, known = map(torch.stack, zip(*map(self._rows.velocity, self._views), strict=True))
@@ -181,7 +181,7 @@ class GrowingBundle:
         return RowMotions(twist, self._rows.times)
 
     def _normalise(self) -> None:
-        """Median depth 1, so that limits and thresholds mean the same everywhere."""
+        """Scale to a median depth of 1, so that limits and thresholds always mean the same."""
         known = torch.cat([d[i > 0] for d, i in zip(self._depth, self._information, strict=True)])
         if not len(known):
             return

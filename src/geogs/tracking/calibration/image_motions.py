@@ -1,4 +1,4 @@
-"""How what a view shows moves while it is read, by the images beside it in the video."""
+"""Image motion of a view during readout, from the images next to it in the video."""
 
 from collections import deque
 from typing import Any, NamedTuple
@@ -13,10 +13,10 @@ from geogs.tracking.frames.row_errors import slope_at_zero
 from geogs.world.grid import SampleGrid
 
 EITHER_SIDE, FARTHEST = 2, 0.3
-"""Images before a view and after it, and the seconds that one of them may be away: of a wave the
-nearest alone show too little (docs/notebook/calibration.md)."""
+"""Number of images before and after a view, and their largest distance in seconds: for an
+oscillating motion the nearest alone show too little (docs/notebook/calibration.md)."""
 LONG_EDGE = 256
-"""Pixels of the images that flow is measured on, at most."""
+"""Largest long edge, in pixels, of the images for flow."""
 
 
 class TimedImage(NamedTuple):
@@ -46,11 +46,11 @@ class ImageMotions:
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._latest = deque[_Seen](maxlen=EITHER_SIDE + 1)
         self._beside: dict[int, list[_Seen]] = {}
-        """Images around those that are followed, with these themselves."""
+        """Images around each followed one, including itself."""
         self._velocities: dict[int, tuple[Tensor, Tensor]] = {}
 
     def see(self, frame: int, image: TimedImage) -> None:
-        """Take the next image of the video."""
+        """Add the next image of the video."""
         grey = cv2.cvtColor(image.image, cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
         latest = _Seen(frame, image.timestamp, small)
@@ -60,12 +60,12 @@ class ImageMotions:
         self._latest.append(latest)
 
     def follow(self) -> None:
-        """Remember what lies beside the last image."""
+        """Store the neighbours of the last image."""
         self._beside[self._latest[-1].frame] = list(self._latest)
 
     def of(self, frame: int) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
-        """Pixels per second of what the cells of an image show, and where they are known: the slope
-        of the polynomial through their places in the images beside it."""
+        """Return the velocities of an image's cells in pixels per second, and where they are known:
+        the slope of the polynomial through their positions in the neighbouring images."""
         if frame not in self._velocities:
             self._velocities[frame] = self._measured(frame)
         return self._velocities[frame]

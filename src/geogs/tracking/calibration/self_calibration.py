@@ -1,4 +1,4 @@
-"""The lens of a video, from the video: what its stretches say, and a verdict."""
+"""Self-calibration of a video's lens from stretches of the video, with a verdict."""
 
 import math
 from collections.abc import Iterable
@@ -25,34 +25,34 @@ from geogs.types import Frame
 from geogs.world.grid import SampleGrid
 
 LONG_EDGE = 512
-"""Pixels of the images that are matched, at most, whatever the run tracks on: what the limits of
-parallax and of matched cells were chosen at (docs/notebook/calibration.md)."""
+"""Largest long edge, in pixels, of the matched images, whatever the run tracks on; the limits of
+parallax and of matched cells were chosen at it (docs/notebook/calibration.md)."""
 TIMED = 32
-"""Pixels of the long edge of the grid on which it is asked when pixels are seen."""
+"""Long edge, in pixels, of the grid on which times of pixels are computed."""
 STRETCHES = 3
-"""Stretches of the video that are asked, at most, each after the one before it: bounds the time."""
+"""Most stretches of the video that are tried, one after the other: bounds the time."""
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """The camera of a video, as far as the video tells it."""
+    """Camera estimated from a video."""
 
     camera: Camera
     """Camera of the working image; the guess where there is a ``failure``."""
     distortion: tuple[float, float] | None = None
-    """OpenCV's k1 and k2; none where they were not asked for, or the video does not tell that the
-    lens bends."""
+    """OpenCV's k1 and k2; None where they were not estimated, or the video does not show any
+    distortion."""
     deviation: float = math.inf
     """Standard deviation of the focal length, relative."""
     deviations: tuple[float, float] | None = None
     """Standard deviations of k1 and k2."""
     keyframes: int = 0
     frames: int = 0
-    """Frames that were used."""
+    """Number of frames used."""
     failure: str | None = None
-    """Why the video does not tell; "the camera only turns", for the middle of a sentence."""
+    """Reason of a failure, such as "the camera only turns", for the middle of a sentence."""
     readout: FoundReadout = field(default_factory=FoundReadout)
-    """Of its shutter, as far as the video tells it where it was asked for it."""
+    """Readout of its shutter, if it was estimated."""
 
 
 @on_one_torch_thread
@@ -65,15 +65,15 @@ def self_calibrate(
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
 ) -> SelfCalibration:
-    """Estimate what is not known of the camera that took ``frames``, their rows as they came: the
-    focal length alone where no ``unknowns`` are named.
+    """Estimate the ``unknowns`` (default: the focal length) of the camera that took ``frames``,
+    whose rows are not rectified.
 
-    ``camera`` is that of the frames. Its aspect and principal point are believed; its focal length,
-    where that is unknown, is only one of several to start from. Flow is measured by the operator
-    without a network. Stretch after stretch of the video is asked until one tells. Lens and readout
-    are estimated together: what rows shear and stretch passes for another lens otherwise.
-    ``report`` is called with the fraction done; what it raises passes through. Outside a ``mask``
-    nothing is matched, nor what is quite black where ``black_is_masked``.
+    ``camera`` is that of the frames. Its aspect and principal point are assumed exact; its focal
+    length, if unknown, is one of several initial values. Flow is measured by the operator without a
+    network. Stretches of the video are tried until one succeeds. Lens and readout are estimated
+    together, as shear and stretch by rows would be mistaken for another lens.
+    ``report`` is called with the fraction done; its exceptions are passed on. Pixels outside a
+    ``mask`` are not matched, nor black ones with ``black_is_masked``.
     """
     unknowns = unknowns or Unknowns()
     small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
@@ -106,18 +106,18 @@ def self_calibrate(
             found.deviations[1:] if bends else None, found.keyframes, gatherer.frames,
             readout=found.readout or FoundReadout(),
         )  # fmt: skip
-    # That nothing explains a stretch weighs more than what the others lack.
+    # That no camera explains a stretch is more important than what the others lack.
     failure = min(failures, key=lambda said: said != Degeneracy.UNEXPLAINED.value)
     return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
 
 
 def _part_of(report: Report, n: int) -> Report:
-    """Report the n-th part as half of what is left, as nobody knows whether there is another."""
+    """Report the n-th part as half of the rest, as it is unknown whether there is another."""
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
 
 
 def _row_times(camera: RollingCamera, small: Camera) -> RowTimes:
-    """When pixels of undistorted images are seen: the plane that comes nearest."""
+    """Fit times of pixels of undistorted images by a plane."""
     rays = small.with_long_edge(TIMED).rays(torch.float64).reshape(-1, 3)
     times = camera.line_times(camera.pixels(rays.numpy()))
     at = np.c_[small.pixels(rays[:, :2]).numpy(), np.ones(len(rays))]

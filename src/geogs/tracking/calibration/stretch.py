@@ -1,4 +1,4 @@
-"""One stretch of a video whose views are placed and adjusted together with the lens."""
+"""One stretch of a video whose views are located and adjusted together with the lens."""
 
 from collections.abc import Callable
 
@@ -13,20 +13,20 @@ from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 START_KEYFRAMES = 12
-"""Keyframes of a stretch that are solved first, and by which it then grows."""
+"""Number of keyframes of a stretch solved first, and added each time it grows."""
 KEYFRAMES = 24
 """Most keyframes of a stretch; they are added until the focal length is known well enough."""
 ENOUGH_DEVIATION, ENOUGH_ERROR = 0.01, 0.003
-"""Relative deviation of the focal length, and seconds of the readout's, from which no more
-keyframes of a stretch are used: all matches of the run are asked again at its end
+"""Relative deviation of the focal length, and deviation of the readout in seconds, below which a
+stretch needs no more keyframes: both are estimated again from all matches at the end of the run
 (docs/notebook/lens.md)."""
 SMALL_IMAGE = 400
-"""Pixels of the long edge of images that are matched at full resolution from the start, larger ones
-at half of it first."""
+"""Long edge, in pixels, up to which images are matched at full resolution from the start; larger
+ones at half of it first."""
 MIN_PARALLAX = 0.003
-"""Motion that rotation does not explain, needed between two keyframes, of the long edge: some
-deviations of a match, from which on views can be placed. Whether they tell the focal length their
-adjustment says (docs/notebook/calibration.md)."""
+"""Least motion not explained by rotation between two keyframes, as a fraction of the long edge:
+some deviations of a match, enough to locate views. Whether it determines the focal length is shown
+by the adjustment (docs/notebook/calibration.md)."""
 MIN_VIEWS = 4
 NOT_FOLLOWED = "its motion could not be followed"
 
@@ -34,7 +34,7 @@ Report = Callable[[float], None]
 
 
 class Stretch:
-    """Views that follow each other, from where the gatherer is."""
+    """Consecutive views, from the gatherer's position on."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Stretch:
         report: Report,
         rows: OpenRows | None = None,
     ) -> None:
-        """``rows`` of a shutter that may roll."""
+        """``rows`` of a possibly rolling shutter."""
         self.grid, self.operator, self.unknowns = grid, operator, unknowns
         self._gatherer, self._report, self._rows = gatherer, report, rows
         self._views: list[View] = []
@@ -53,18 +53,18 @@ class Stretch:
         self._min_parallax = MIN_PARALLAX * grid.camera.long_edge
 
     def _tick(self) -> None:
-        """Every frame is a safe point."""
+        """Report progress; called at every frame."""
         self._report(self._done)
 
     def _gather(self, count: int) -> bool:
-        """Whether there are more views than before."""
+        """Gather views; return whether there are more than before."""
         before = len(self._views)
         self._views = self._gatherer.gather(self._views, count, self._tick)
         return len(self._views) > before
 
     def ask(self) -> Estimate | str:
-        """Place and adjust views, more of them until the focal length is known; what they say of
-        it, or why they say nothing."""
+        """Locate and adjust more and more views until the focal length is known; return the
+        estimate, or the reason why there is none."""
         start = self._start()
         if isinstance(start, Degeneracy):
             return start.value
@@ -77,7 +77,7 @@ class Stretch:
                 self._tick()
                 if not bundle.place(view):
                     return said
-            # Matches are searched again from where the first adjustment has them.
+            # Matches are searched again from their positions after the first adjustment.
             for fine in (self.grid.camera.long_edge <= SMALL_IMAGE, True):
                 if not self._adjusted(bundle, fine):
                     return said
@@ -89,12 +89,12 @@ class Stretch:
                 return said
 
     def _adjusted(self, bundle: GrowingBundle, fine: bool) -> bool:
-        """Whether views were matched and adjusted."""
+        """Match and adjust the views; return whether it succeeded."""
         bundle.measure(fine, self._tick)
         return bundle.adjust()
 
     def _start(self) -> Start | Degeneracy:
-        """The first views that show parallax and depth, placed by the best candidate."""
+        """Return the first views with parallax and depth, located with the best candidate."""
         failure = Degeneracy.BLANK
         while failure is not Degeneracy.UNEXPLAINED and self._gather(START_KEYFRAMES):
             if len(self._views) < MIN_VIEWS:
@@ -105,7 +105,7 @@ class Stretch:
                 self._done = 0.3
                 return found
             failure = found
-            # What comes later may show more.
+            # Later views may show more.
             self._views = self._views[len(self._views) // 2 :]
         return failure
 
@@ -114,7 +114,7 @@ class Stretch:
         wrong = degeneracy(camera, flows, self._min_parallax)
         if wrong is not None and (self.unknowns.focal or wrong is not Degeneracy.PLANAR):
             return wrong
-        # One after the other: beside each other their many small operations wait for Python.
+        # One after the other: in parallel their many small operations would wait for Python.
         starts = (
             try_candidate(lens, flows, self._min_parallax, self.unknowns)
             for lens in candidates(camera, self.unknowns)
@@ -123,12 +123,12 @@ class Stretch:
         if not found:
             return Degeneracy.TURNING
         best = min(found, key=lambda s: s.penalised)
-        # Rows that roll are not explained yet.
+        # A rolling shutter is not modelled yet.
         is_explained = best.cost <= MAX_COST or self._rows is not None
         return best if is_explained else Degeneracy.UNEXPLAINED
 
 
 def _is_enough(said: Estimate) -> bool:
-    """Whether more keyframes need not be asked."""
+    """Whether no more keyframes are needed."""
     readout = said.readout
     return said.deviation < ENOUGH_DEVIATION and (readout is None or readout.error < ENOUGH_ERROR)

@@ -1,4 +1,4 @@
-"""What of a camera is not known before a run."""
+"""Unknown parameters of a camera before a run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,24 +16,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The numbers of a camera that its video is asked for."""
+    """Parameters of a camera to be estimated from its video."""
 
     focal: bool = True
     """Whether the focal length is estimated."""
     radial: bool = False
     """Whether k1 and k2 are estimated."""
     rolling: RollingCamera | None = None
-    """The camera as its lines are read; none of a global shutter."""
+    """Camera with its readout direction; None for a global shutter."""
     readout: float | None = None
-    """Seconds of its readout; estimated where it is none and the camera is ``rolling``."""
+    """Readout in seconds; estimated if it is None and the camera is ``rolling``."""
 
 
 @dataclass(frozen=True)
 class OpenRows:
-    """Rows of a rolling shutter in images as they came."""
+    """Rows of a rolling shutter in images that were not rectified."""
 
     times: RowTimes
     velocity: Callable[["View"], tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]]
-    """Pixels per second of what the cells of a view show, and where they are known."""
+    """Returns velocities of a view's cells in pixels per second, and where they are known."""
     readout: float | None = None
-    """Seconds, where it is known."""
+    """Readout in seconds, if known."""

@@ -1,4 +1,4 @@
-"""Keyframes of a camera about which nothing is known, and the flow between them."""
+"""Keyframes of an uncalibrated camera, and the flow between them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
 
 FRAMES = 600
-"""Frames of the video that are used, at most: bounds the time."""
+"""Most frames of the video that are used: bounds the time."""
 
 
 @dataclass(frozen=True)
@@ -31,36 +31,36 @@ class View:
     """A keyframe without a pose."""
 
     frame: int
-    """Which image of the video it is."""
+    """Number of its image in the video."""
     encoded: Any
     step: ChainedMatch | None
     """Flow between the keyframe before it and this one; None for the first."""
 
 
 class ViewGatherer:
-    """Takes keyframes by image motion alone, which needs no focal length."""
+    """Selects keyframes by image motion alone, which needs no focal length."""
 
     def __init__(
         self, images: Iterator[TimedImage], grid: SampleGrid, operator: FlowOperator
     ) -> None:
-        """``images`` of the grid's size."""
+        """``images``: of the grid's size."""
         self._images, self._grid, self._operator = images, grid, operator
         self._config = TrackingConfig()
         self._chain = ChainedPositions()
         self.frames = 0
-        """Frames taken so far."""
+        """Number of frames read so far."""
         self._is_read = False
         self._motions = ImageMotions(grid)
 
     @property
     def is_over(self) -> bool:
-        """Whether no frame is left, or ``FRAMES`` are enough."""
+        """Whether no frame is left, or ``FRAMES`` have been read."""
         return self._is_read or self.frames >= FRAMES
 
     def gather(self, views: list[View], count: int, tick: Callable[[], None]) -> list[View]:
-        """``views`` grown to ``count``, or less where the video is over.
+        """Extend ``views`` to ``count``, or fewer at the end of the video.
 
-        The frames begin anew where the view changes at once, with what comes after.
+        After a sudden change of view they begin anew.
         """
         views = list(views)
         while len(views) < count and not self.is_over:
@@ -93,14 +93,14 @@ class ViewGatherer:
         return views
 
     def velocity(self, view: View) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
-        """Pixels per second of what the cells of a view show, and where they are known."""
+        """Return velocities of a view's cells in pixels per second, and where they are known."""
         return self._motions.of(view.frame)
 
 
 def flows_from_first(
     grid: SampleGrid, operator: FlowOperator, views: list[View]
 ) -> list[FlowMatch]:
-    """Flow from the first view to each later one: chained over the steps and measured again."""
+    """Measure flow from the first view to each later one, starting from the chained steps."""
     there: Float[Tensor, "p 2"] = grid.pixels
     back = grid.pixels
     flows = []

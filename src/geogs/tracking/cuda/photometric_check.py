@@ -1,4 +1,4 @@
-"""The photometric check of a location on the GPU, in a few launches."""
+"""Photometric check of a pose on the GPU, in a few launches."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from geogs.world.grid import STRIDE, SampleGrid
 
 SOURCE = Path(__file__).with_name("photometric_check.cu")
 WINDOWS = 8
-"""Windows of a block of threads."""
+"""Windows per block of threads."""
 
 
 def median_correlation(
@@ -25,12 +25,11 @@ def median_correlation(
     information: Float[Tensor, "p"] | None = None,
     pixels: Float[Tensor, "p 2"] | None = None,
 ) -> Float[Tensor, "2"]:
-    """Median correlation of the windows around every ``step``-th cell that count, and their number.
+    """Return the median correlation of the windows around every ``step``-th cell, and their number.
 
-    Cells lie where the relative pose ``T_ji`` (float64) and their depth put them, or, without it,
-    at ``pixels``. Those without information do not count, nor do windows whose variance in the
-    first image, once smoothed, is no more than ``least_variance``. The result is float64 and stays
-    on the GPU.
+    Cells are projected by the relative pose ``T_ji`` (float64) and their depth or, without it, lie
+    at ``pixels``. Cells without information do not count, nor do windows whose smoothed variance in
+    the first image is at most ``least_variance``. The result is float64 and stays on the GPU.
     """
     c, device = grid.camera, first.device
     count = -(-grid.size // step)
@@ -51,7 +50,7 @@ def median_correlation(
 def matched_motion(
     grid: SampleGrid, pixels: Float[Tensor, "p 2"], weight: Float[Tensor, "p 2"]
 ) -> Float[Tensor, "2"]:
-    """:func:`~geogs.tracking.matching.photometric_check.matched_motion`, float64, on the GPU."""
+    """Run :func:`~geogs.tracking.matching.photometric_check.matched_motion` on the GPU; float64."""
     keys = torch.empty(grid.size, dtype=torch.int32, device=pixels.device)
     found = torch.empty(2, dtype=torch.float64, device=pixels.device)
     kernels_for(SOURCE, pixels.device)["matched_motion"](

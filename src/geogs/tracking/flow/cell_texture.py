@@ -1,4 +1,4 @@
-"""Where an image has enough structure to be matched, and along which axis, whatever matches it."""
+"""Texture of an image for matching, along each axis, independent of the flow operator."""
 
 from dataclasses import dataclass
 
@@ -9,19 +9,19 @@ from jaxtyping import Float, Float32, UInt8
 from geogs.world.grid import OFFSET, STRIDE
 
 UNINFORMED = 0.01
-"""Weight, of the full one, of a match along a direction in which the image does not change: a flow
-that is smoothed goes on there as it does around."""
+"""Fraction of the full weight of a match along a direction in which the image does not change:
+smoothed flow continues there from the surroundings."""
 SHARP = 2.0
-"""Structure along a direction from which on more of it does not help, grey levels^2 / pixel^2."""
+"""Structure along a direction above which more does not help, grey levels^2 / pixel^2."""
 MIN_STRUCTURE = 0.5
-"""Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
+"""Least smaller eigenvalue of the structure tensor of texture, grey levels^2 / pixel^2."""
 
 
 @dataclass(frozen=True, slots=True)
 class CellStructure:
     """Structure tensors of an image at the cells of the sample grid, row by row.
 
-    They are kept as their mean eigenvalue and what is left of them, grey levels^2 / pixel^2.
+    They are stored as their mean eigenvalue and the rest, grey levels^2 / pixel^2.
     """
 
     mean: Float[np.ndarray, "p"]
@@ -46,12 +46,12 @@ class CellStructure:
 
         A point on an edge is known across the edge, hardly along it. The information of a match is
         that of the structure tensor with each eigenvalue l replaced by min(1, l / SHARP +
-        UNINFORMED); what it says of one coordinate while the other is open is the inverse of its
-        inverse's diagonal. So an upright edge counts in x, a level one in y, a slanted one little
-        in either.
+        UNINFORMED); its information on one coordinate with the other unknown is the inverse of its
+        inverse's diagonal. So a vertical edge counts in x, a horizontal one in y, a slanted one
+        little in either.
         """
         eigenvalues = (self.mean + self.radius, self.smaller)
-        # Of what two images have in common they may be negative, which is nothing.
+        # For the common tensor of two images they may be negative, which counts as zero.
         across, along = (
             np.clip(value / SHARP, 0, 1 - UNINFORMED) + UNINFORMED for value in eigenvalues
         )
@@ -61,7 +61,7 @@ class CellStructure:
 
 
 def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> CellStructure:
-    """Structure of an image at the cells of the sample grid."""
+    """Compute the structure of an image at the cells of the sample grid."""
     parts = common_tensor(grey, grey)
     return structure_of(*(p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in parts))
 
@@ -69,7 +69,7 @@ def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> CellStructure:
 def structure_of(
     xx: Float[np.ndarray, "p"], yy: Float[np.ndarray, "p"], xy: Float[np.ndarray, "p"]
 ) -> CellStructure:
-    """Structure of the cells with these tensors."""
+    """Return the structure of cells with these tensors."""
     half = (xx - yy) / 2
     return CellStructure((xx + yy) / 2, half, np.sqrt(half * half + xy * xy))
 
@@ -77,11 +77,11 @@ def structure_of(
 def common_tensor(
     first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], window: int = 9
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Structure tensor (xx, yy, xy) of what two images have in common that show the same at each
-    pixel: products of their gradients, averaged over a window of so many pixels a side.
+    """Compute the common structure tensor (xx, yy, xy) of two aligned images: products of their
+    gradients, averaged over a window of ``window`` pixels a side.
 
-    That of an image with itself is the image's own. Noise adds its own gradients' squares to it,
-    but nothing in the mean to that of two images, whose noise is independent.
+    With itself, an image gives its own structure tensor. Noise adds the squares of its gradients to
+    that, but has zero mean for two images, whose noise is independent.
     """
     ax, ay = _gradients(first)
     bx, by = (ax, ay) if second is first else _gradients(second)
@@ -91,5 +91,5 @@ def common_tensor(
 
 
 def _gradients(grey: UInt8[np.ndarray, "h w"]) -> list[Float32[np.ndarray, "h w"]]:
-    """Gradients along x and y, grey levels / pixel."""
+    """Return gradients along x and y, grey levels / pixel."""
     return [cv2.Sobel(grey, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))]

@@ -1,9 +1,9 @@
-"""Flow without a network: dense inverse search on what the present reprojection leaves over.
+"""Flow without a network: dense inverse search of the residual flow after reprojection.
 
-The second image is warped into the first by the reprojection and brought to its local brightness,
+The second image is warped into the first by the reprojection and adjusted to its local brightness,
 OpenCV's DIS flow is computed on the pair and the warp is added back, so wide baselines are matched
 as well as narrow ones. Both directions are computed; their disagreement and the roughness of the
-flow that was left over give the variance of a match.
+residual flow give the variance of a match.
 """
 
 import threading
@@ -25,9 +25,9 @@ from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
-"""Stands for a position outside the image, in pixels."""
+"""Value for positions outside the image, in pixels."""
 MAX_DISAGREEMENT = 1.0
-"""Forward and backward flow that differ by more pixels are no match."""
+"""Largest difference in pixels of forward and backward flow of a match."""
 COARSE_DEVIATION = 1.7
 """Deviation of a match at half resolution relative to full resolution."""
 SMALL_IMAGE = 400
@@ -36,7 +36,7 @@ SMALL_IMAGE = 400
 
 @dataclass(frozen=True)
 class ClassicalImage:
-    """An image as the classical operator keeps it."""
+    """An image encoded by the classical operator."""
 
     grey: UInt8[np.ndarray, "h w"]
     half: UInt8[np.ndarray, "h2 w2"]
@@ -53,41 +53,41 @@ class _Level:
         width, height = -(-grid.camera.width // step), -(-grid.camera.height // step)
         v, u = np.mgrid[:height, :width].astype(np.float32)
         self.u, self.v = u, v
-        # The same pixels in cells of the grid.
+        # The pixels in units of the grid's cells.
         across, down = ((self.to_image(x) - OFFSET) / STRIDE for x in (u[0], v[:, 0]))
         self.lattice = Lattice(across, down, grid.height, grid.width)
 
     def to_image(self, x: np.ndarray) -> np.ndarray:
-        """Coordinates of this level in the full image."""
+        """Convert coordinates of this level to the full image."""
         return self.step * x + np.float32((self.step - 1) / 2)
 
     def from_image(self, x: np.ndarray) -> np.ndarray:
-        """Coordinates of the full image on this level."""
+        """Convert coordinates of the full image to this level."""
         return (x - np.float32((self.step - 1) / 2)) / self.step
 
 
 @dataclass(frozen=True)
 class _DenseFlow:
-    """A known warp, the dense flow that was left over, and how rough that is."""
+    """A known warp, the dense residual flow, and the images of the latter."""
 
     level: _Level
     warp: StartFlow | None
-    """Image pixels, over cells of the grid."""
+    """Warp in image pixels, over cells of the grid."""
     rest: np.ndarray
-    """On the level's pixels, level pixels."""
+    """Residual flow on the level's pixels, in level pixels."""
     source: UInt8[np.ndarray, "a b"]
     target: UInt8[np.ndarray, "a b"]
-    """The images that it is the flow between; the latter is warped already."""
+    """Second image, already warped."""
 
     def at(self, points: Float[np.ndarray, "p 2"], outside: float) -> Float[np.ndarray, "p 2"]:
-        """Flow of image points; ``outside`` where they are not in the image."""
+        """Return the flow of image points; ``outside`` where they are not in the image."""
         moved = self.level.step * _sample(self.rest, self.level.from_image(points), outside)
         if self.warp is None:
             return moved
         return moved + self.warp.at((points + moved - OFFSET) / STRIDE)
 
     def roughness(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p"]:
-        """Norm of the gradient of the rest around image points."""
+        """Return the norm of the residual flow's gradient around image points."""
         gx = cv2.Sobel(self.rest, cv2.CV_32F, 1, 0, scale=1 / 8)
         gy = cv2.Sobel(self.rest, cv2.CV_32F, 0, 1, scale=1 / 8)
         norm = cv2.sqrt(cv2.transform(gx * gx + gy * gy, np.ones((1, 2), np.float32)))
@@ -95,17 +95,17 @@ class _DenseFlow:
         return _sample(cv2.blur(norm, (window, window)), self.level.from_image(points), None)
 
     def certainty(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2"]:
-        """Certainty of matches of image points along x and y, by what both images show there."""
+        """Return the certainty of matches of image points along x and y, by common texture."""
         level = self.level
         found = _warped(self.target, level.u + self.rest[..., 0], level.v + self.rest[..., 1])
         tensor = common_tensor(self.source, found, 8 // level.step + 1)
-        # Gradients of the level are by its own pixels.
+        # Gradients of the level are per pixel of the level.
         at = level.from_image(points)
         return structure_of(*(_sample(p, at, None) / level.step**2 for p in tensor)).certainty
 
 
 class ClassicalFlow:
-    """The DIS operator on one grid; directions and images are matched side by side in threads."""
+    """The DIS operator on one grid; directions and images are matched in parallel threads."""
 
     def __init__(self, grid: SampleGrid) -> None:
         opencv_on_one_thread()
@@ -135,7 +135,7 @@ class ClassicalFlow:
         fine: bool = True,
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
-        # Half of a small image is too little to match.
+        # A small image at half resolution is too small for matching.
         fine = fine or self.grid.camera.long_edge <= SMALL_IMAGE
         a, b = [*first, *second], [*second, *first]
         n = len(first)
@@ -153,22 +153,22 @@ class ClassicalFlow:
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
 
     def _workers(self) -> ThreadPoolExecutor:
-        """Workers of the calling thread: a frame does not wait behind what a keyframe measures."""
+        """Return workers of the calling thread: a frame does not wait for a keyframe's matching."""
         found: ThreadPoolExecutor | None = getattr(self._local, "pool", None)
         if found is None:
             found = self._local.pool = ThreadPoolExecutor(worker_count())
         return found
 
     def _dis(self, cold: bool) -> cv2.DISOpticalFlow:
-        """This thread's flow object, for unwarped or warped pairs."""
+        """Return this thread's flow object, for unwarped or warped pairs."""
         name = "cold" if cold else "warm"
         found = getattr(self._local, name, None)
         if found is None:
-            # OpenCV's stubs know the class, not its factory.
+            # OpenCV's stubs have the class, but not its factory.
             found = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # type: ignore[attr-defined]
             found.setFinestScale(0)
             if not cold:
-                # Measured: as precise as the preset on warped pairs, at half its time.
+                # Measured: as precise as the preset on warped pairs, in half its time.
                 found.setGradientDescentIterations(6)
                 found.setPatchStride(5)
                 found.setVariationalRefinementIterations(3)
@@ -181,7 +181,7 @@ class ClassicalFlow:
     def _dense(
         self, a: ClassicalImage, b: ClassicalImage, start: np.ndarray | None, fine: bool
     ) -> _DenseFlow:
-        """Flow from a to b, whose positions in b are about ``start``."""
+        """Compute flow from a to b, starting from positions ``start`` in b."""
         level = self._full if fine else self._half
         source, target = (x.grey if fine else x.half for x in (a, b))
         warp = None
@@ -191,12 +191,12 @@ class ClassicalFlow:
             dense = warp.on(level.lattice) / level.step
             target = _warped(target, level.u + dense[..., 0], level.v + dense[..., 1])
         target = _match_brightness(target, source)
-        # OpenCV makes the output where None is given, which its stubs do not say.
+        # OpenCV allocates the output for None, which its stubs do not allow.
         flow = self._dis(start is None).calc(source, target, None)  # type: ignore[call-overload]
         return _DenseFlow(level, warp, flow, source, target)
 
     def _match(self, there: _DenseFlow, back: _DenseFlow) -> tuple[np.ndarray, np.ndarray]:
-        """Positions on the grid and their weights."""
+        """Return matched positions of the grid's cells and their weights."""
         flow = there.at(self._pixels, 0.0)
         q = self._pixels + flow
         disagreement = np.linalg.norm(flow + back.at(q, FAR), axis=-1)
@@ -206,7 +206,7 @@ class ClassicalFlow:
         deviation = match_deviation(disagreement, there.roughness(self._pixels))
         if there.level.step > 1:
             deviation = deviation * COARSE_DEVIATION
-        # Without texture the flow stays where it started, smooth and consistent but uninformed.
+        # Without texture the flow stays at its start, smooth and consistent but uninformed.
         weight = (ok / deviation**2)[:, None] * there.certainty(self._pixels)
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
         return q, weight.astype(np.float32)
@@ -215,7 +215,7 @@ class ClassicalFlow:
 def _sample(
     image: np.ndarray, points: Float[np.ndarray, "p 2"], outside: float | None
 ) -> np.ndarray:
-    """Bilinear values at points; ``outside`` beyond the border, None replicates it."""
+    """Interpolate at points bilinearly; ``outside`` beyond the border, None replicates it."""
     u, v = (points[None, :, k].astype(np.float32) for k in (0, 1))
     if outside is None:
         return bilinear(image, u, v)[0]
@@ -227,13 +227,13 @@ def _sample(
 def match_deviation(
     disagreement: Float[np.ndarray, "p"], roughness: Float[np.ndarray, "p"]
 ) -> Float[np.ndarray, "p"]:
-    """Standard deviation of a match along any direction, pixels.
+    """Return the standard deviation of a match along any direction, pixels.
 
     Fitted to true flow of rendered rooms, given the forward-backward disagreement in pixels and the
     mean gradient of the flow left after warping, which is large at occlusions and where texture is
-    missing; image structure and photometric difference add little. It is 1.4 times the deviation
-    of a single match, because the errors of a cell are alike in all its edges and the bundle
-    adjustment takes them for independent.
+    missing; image structure and photometric difference add little. It is 1.4 times the deviation of
+    a single match, because the errors of a cell are correlated over its edges, but the bundle
+    adjustment assumes them to be independent.
     """
     return 0.06 + 0.8 * disagreement + 3.4 * roughness
 
@@ -251,14 +251,14 @@ def _warped(
 def _match_brightness(
     image: UInt8[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """The image with the slowly varying brightness of the reference; light and gain drop out."""
+    """Adjust the local brightness of an image to the reference, to cancel light and gain."""
     ratio = (_local_mean(reference) + 4.0) / (_local_mean(image) + 4.0)
     gain = cv2.resize(np.clip(ratio, 0.2, 5.0), image.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.clip((image + np.float32(4.0)) * gain - 4.0, 0, 255).astype(np.uint8)
 
 
 def _local_mean(image: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "r c"]:
-    """Mean over about an eighth of the long edge, at an eighth of the resolution."""
+    """Return the mean over about an eighth of the long edge, at an eighth of the resolution."""
     size = (max(image.shape[1] // 8, 1), max(image.shape[0] // 8, 1))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return cv2.GaussianBlur(small, (0, 0), max(size) / 16)

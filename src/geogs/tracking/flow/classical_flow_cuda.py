@@ -1,10 +1,10 @@
 """Flow without a network on a GPU: dense inverse search with variational refinement.
 
-The same idea as the operator on the CPU: the second image is warped to the first by the present
-reprojection and brought to its local brightness, the flow that is left over is found by dense
-inverse search (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016) from
-coarse to fine, and the warp is added back. All directed pairs of a call go through each kernel
-together, and nothing is read back.
+As in the operator on the CPU, the second image is warped to the first by the present reprojection
+and adjusted to its local brightness, the residual flow is estimated by dense inverse search
+(Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016) from coarse to fine, and
+the warp is added back. All directed pairs of a call go through each kernel together, and nothing is
+read back.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,55 +26,55 @@ from geogs.world.grid import SampleGrid
 
 SOURCES = Path(__file__).parents[1] / "cuda"
 TILE = 32
-"""Pixels along the edge of the tile that a block of the pyramid kernels makes."""
+"""Edge in pixels of the tile of a block of the pyramid kernels."""
 PATCH = 8
 """Pixels along the edge of a patch."""
 PATCH_STRIDE = 4
 """Pixels between patches."""
 REFINE_INNER = 24
-"""Pixels along the edge of what a block of the refinement keeps."""
+"""Edge in pixels of the output of a block of the refinement."""
 MEAN_LEVEL = 3
 """Pyramid level on which local brightness is compared."""
 LEVELS = 6
-"""Levels of a pyramid, the image itself included."""
+"""Levels of a pyramid, including the image itself."""
 PAIRS_AT_ONCE = 48
 """Pairs whose images and flows are in memory together."""
 DEVIATION = (0.06, 0.8, 3.4)
 """Standard deviation of a match: constant (pixels), by disagreement, by roughness.
 
-As :func:`geogs.tracking.flow.classical_flow.match_deviation`, fitted to this operator.
+As in :func:`geogs.tracking.flow.classical_flow.match_deviation`, fitted to this operator.
 """
 WARM_LEVELS = 4
 """Pyramid levels searched where the start is right to a few pixels."""
 ITERATIONS = 6
 """Gauss-Newton steps of a patch."""
 COLD_REACHES = (4, 2, 1)
-"""Passes in which a patch tries its neighbours' motions, so many patches away; cold starts."""
+"""Distances, in patches, of neighbours whose motions a patch tries, pass by pass; cold starts."""
 REFINEMENTS = 5
 """Linearisations of the variational refinement at the finest level."""
 COARSE_REFINEMENTS = 3
-"""The same at the other levels."""
+"""Linearisations at the other levels."""
 SWEEPS = 10
-"""Relaxation sweeps of each."""
+"""Relaxation sweeps of each at the finest level."""
 COARSE_SWEEPS = 20
-"""The same at the other levels."""
+"""Relaxation sweeps at the other levels."""
 SMOOTHNESS = 10.0
-"""Weight alpha of the smoothness term; less lets more noise in, more bends depth steps."""
+"""Weight alpha of the smoothness term; less lets more noise in, more blurs depth steps."""
 GRADIENTS = 10.0
 """Weight gamma of gradient constancy."""
 BRIGHTNESS = 1.0
 """Weight delta of brightness constancy."""
 ZETA = 0.1
-"""Added to the norms that divide the data terms, grey levels / pixel."""
+"""Constant added to the norms that divide the data terms, grey levels / pixel."""
 EPSILON = 0.001
-"""Where the penalty turns from quadratic to linear."""
+"""Threshold between the quadratic and the linear part of the penalty."""
 RELAXATION = 1.6
 """Over-relaxation of the sweeps."""
 
 
 @dataclass(frozen=True)
 class CudaImage:
-    """An image as the operator keeps it, on the device."""
+    """An image encoded by the operator, on the device."""
 
     data: Float[Tensor, "n"]
     """Grey pyramid, then local means of the brightness."""
@@ -98,7 +98,7 @@ class _Layout:
         self.coarsest = max(k for k, size in enumerate(self.sizes) if min(size) >= PATCH or k == 0)
 
     def patches(self, level: int) -> int:
-        """Number of patches of a level."""
+        """Return the number of patches of a level."""
         across, down = (-(-(n - PATCH) // PATCH_STRIDE) + 1 for n in self.sizes[level])
         return across * down
 
@@ -194,7 +194,7 @@ class CudaClassicalFlow:
         forward: Float[Tensor, "e p 2"] | None,
         backward: Float[Tensor, "e p 2"] | None,
     ) -> Float[Tensor, "d n"]:
-        """Pyramids of the second images, warped and with the first images' brightness."""
+        """Return pyramids of the second images, warped and with the first images' brightness."""
         layout, grid, directed = self._layout, self.grid, len(table)
         w, h, stride = layout.width, layout.height, layout.pyramid
         warped = torch.empty(directed, stride, device=self.device)
@@ -215,7 +215,7 @@ class CudaClassicalFlow:
     def _coarse_to_fine(
         self, table: Int[Tensor, "d"], warped: Float[Tensor, "d n"], cold: bool, finest: int
     ) -> Float[Tensor, "d q 2"]:
-        """Dense flow of the finest level that is asked for, row by row, in its pixels."""
+        """Compute dense flow at level ``finest``, row by row, in its pixels."""
         layout, directed = self._layout, len(table)
         w, h, stride = layout.width, layout.height, layout.pyramid
         coarsest = layout.coarsest if cold else min(WARM_LEVELS - 1, layout.coarsest)

@@ -1,4 +1,4 @@
-"""Correlation of two feature maps around given positions, as DROID-SLAM looks it up (after RAFT).
+"""Correlation of two feature maps around given positions, as in DROID-SLAM (after RAFT).
 
 All-pairs products of the features, averaged over 2 x 2, 4 x 4, ... pixels of the second map, are
 read in a square window around a position (Teed & Deng, "RAFT: Recurrent All-Pairs Field Transforms
@@ -7,8 +7,8 @@ for Optical Flow", ECCV 2020, section 3.2).
 Conventions, which are those of the published networks:
 
 - positions are in pixels of the feature maps, x before y, pixel centres at integers;
-- on level l of the pyramid they are divided by 2^l, no more (the half pixel by which the centres of
-  averaged pixels move is left to the network);
+- on level l of the pyramid they are divided by 2^l only (the network has to learn the half-pixel
+  shift of the centres of averaged pixels);
 - beyond the border the correlation is zero;
 - the channels are ordered by level, then x offset, then y offset: channel
   ``(l (2 r + 1) + i) (2 r + 1) + j`` is at (x + i - r, y + j - r).
@@ -41,7 +41,7 @@ class CorrelationVolume:
         """
         self.radius = radius
         root = scale**0.5
-        # Half of the factor to each side: products of half-precision features stay in range.
+        # Half of the factor on each side: products of half-precision features stay in range.
         a, b = (first * root).flatten(2), (second * root).flatten(2)
         volume = (a.mT @ b).reshape(-1, 1, *second.shape[-2:])
         self._levels = _pyramid(volume, levels)
@@ -55,7 +55,7 @@ class CorrelationVolume:
 
 
 def _pyramid(image: Float[Tensor, "n c h w"], levels: int) -> list[Tensor]:
-    """Means over 2^l x 2^l pixels; a level that has no pixel left is of size zero."""
+    """Return means over 2^l x 2^l pixels; a level without pixels has size zero."""
     found = [image]
     for _ in range(levels - 1):
         height, width = found[-1].shape[-2:]
@@ -72,7 +72,7 @@ def _window(
     coords: Float[Tensor, "b h w 2"],
     radius: int,
 ) -> Float[Tensor, "b c h w"]:
-    """Bilinear window of each row of products, an image of this size; zero outside.
+    """Read a bilinear window of each row of products, an image of this size; zero outside.
 
     All positions of a window have the same fraction, so the values at (2 r + 2)^2 whole pixels are
     enough.
@@ -81,7 +81,7 @@ def _window(
     side = 2 * radius + 1
     if not height or not width:
         return coords.new_zeros(len(coords), side * side, *coords.shape[1:3], dtype=torch.float32)
-    # Far away (or not a number) is as good as just outside.
+    # Far away (or NaN) is equivalent to just outside.
     limit = coords.new_tensor([width, height]) + radius + 1
     near = coords.float().nan_to_num(-1e6).clamp(min=-radius - 2.0).minimum(limit.float())
     corner = near.floor()

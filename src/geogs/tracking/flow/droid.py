@@ -1,16 +1,16 @@
 """The flow operator of DROID-SLAM: recurrent, with a hidden state for every directed edge.
 
-What the network speaks is translated here.
+This module converts between the network's conventions and ours:
 
-- Its cells are centred on the pixels (8 c, 8 r) of what it is shown, those of the sample grid on
-  (4 + 8 c, 4 + 8 r) of the working image. It is shown the image without its first four rows and
-  columns (and continued by up to four at the other end), so cell c is cell c, exactly, and a
+- Its cells are centred on the pixels (8 c, 8 r) of its input, those of the sample grid on
+  (4 + 8 c, 4 + 8 r) of the working image. Its input is the image without the first four rows and
+  columns (and extended by up to four at the other end), so the cells coincide exactly, and a
   position of x cells is at pixel 4 + 8 x.
 - A weight w in (0, 1) enters DROID-SLAM's adjustment as 0.001 w with residuals in cells. Only the
-  ratio of that to the damping was ever learned, so a scale is free here: a weight of 1 is read as a
-  match of deviation ``DroidOptions.deviation`` pixels. Residuals are 8 times as many pixels as
-  cells, hence all curvatures are ``64 / (0.001 deviation^2)`` times those of DROID-SLAM, and so
-  must be its damping, ``0.2 eta + 1e-7``.
+  ratio of that to the damping was ever learned, so a scale is free here: a weight of 1 counts as a
+  match of deviation ``DroidOptions.deviation`` pixels. Residuals in pixels are 8 times those in
+  cells, so all curvatures are ``64 / (0.001 deviation^2)`` times those of DROID-SLAM, and so must
+  be its damping, ``0.2 eta + 1e-7``.
 """
 
 from collections.abc import Sequence
@@ -38,41 +38,41 @@ from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e4
-"""Cells beyond which a position is as good as lost."""
+"""Limit of positions, in cells."""
 WEIGHT_SCALE = 0.001
 """DROID-SLAM's factor on the weights."""
 DAMPING_FACTOR, DAMPING_FLOOR = 0.2, 1e-7
-"""DROID-SLAM's factor on the damping, and what it adds."""
+"""DROID-SLAM's factor on the damping, and the constant that it adds."""
 
 
 @dataclass(frozen=True)
 class DroidOptions:
-    """How often the network is run, and how its output is read."""
+    """Numbers of updates, and interpretation of the network's output."""
 
     updates: int = 2
     """Updates of a measurement that starts from a reprojection; nothing is adjusted in between."""
     fine_updates: int = 4
-    """The same where a precise measurement is asked for."""
+    """Updates of a precise measurement."""
     cold_updates: int = 8
-    """Updates of a measurement that starts from nothing."""
+    """Updates of a measurement without a start."""
     deviation: float = 0.3
     """Standard deviation of a match of weight 1, pixels."""
     min_confidence: float = 0.05
-    """Matches whose mean weight is smaller are none."""
+    """Least mean weight of a match."""
     edges_at_once: int = 32
     """Directed edges that go through the network together; bounds memory."""
 
 
 @dataclass(frozen=True)
 class DroidImage:
-    """An image as the operator keeps it, on the device; half precision on a GPU."""
+    """An image encoded by the operator, on the device; half precision on a GPU."""
 
     features: Float[Tensor, "c h w"]
     """Matching features."""
     hidden: Float[Tensor, "c h w"]
-    """Hidden state that an edge from this image starts with."""
+    """Initial hidden state of an edge from this image."""
     static: Float[Tensor, "c h w"]
-    """Static context, which every update sees."""
+    """Static context, an input of every update."""
     grey: UInt8[Tensor, "y x"]
     texture: float
     """Fraction of the cells with structure."""
@@ -84,7 +84,7 @@ class DroidMemory:
 
     hidden: Float[Tensor, "c h w"]
     target: Float[Tensor, "h w 2"]
-    """Last positions that the network found, in cells."""
+    """Last positions from the network, in cells."""
 
 
 class DroidFlow:
@@ -143,7 +143,7 @@ class DroidFlow:
         hidden, position, confidence = (torch.cat(p) for p in zip(*parts, strict=True))
         pixels, weight = self._weighed(position, confidence)
         damping = self._damping(source, hidden)
-        # Copies, so that one edge that is kept does not keep all.
+        # Copies, so that one edge does not keep all in memory.
         kept = tuple(
             DroidMemory(h.clone(), p.clone()) for h, p in zip(hidden, position, strict=True)
         )
@@ -175,7 +175,7 @@ class DroidFlow:
         """
         shape = (len(source), self.grid.height, self.grid.width, 2)
         position = (start.reshape(shape) - OFFSET) / STRIDE
-        # Points close to or behind the second camera can be anywhere.
+        # Points close to or behind the second camera can project anywhere.
         position = position.nan_to_num(FAR).clamp(-FAR, FAR)
         hidden = torch.stack(
             [s.hidden if m is None else m.hidden for s, m in zip(source, before, strict=True)]
@@ -193,14 +193,14 @@ class DroidFlow:
                     hidden, static, lookup(position), motion_features(position, last)
                 )
                 hidden, weight = out.hidden, out.weight.permute(0, 2, 3, 1).float()
-                # The best guess of where the adjustment would move the reprojection to.
+                # The best guess of the reprojection after an adjustment.
                 position = last = position + out.delta.permute(0, 2, 3, 1).float()
         return hidden, position, weight
 
     def _damping(
         self, source: Sequence[DroidImage], hidden: Float[Tensor, "d c h w"]
     ) -> Float[Tensor, "d p"]:
-        """Damping of the inverse depth of each edge's source, from all edges that leave it."""
+        """Return damping of the inverse depth of each edge's source, from its outgoing edges."""
         number: dict[int, int] = {}
         place = [number.setdefault(id(image), len(number)) for image in source]
         index = to_device(torch.tensor(place), self.device)
@@ -212,7 +212,7 @@ class DroidFlow:
     def _weighed(
         self, position: Float[Tensor, "d h w 2"], confidence: Float[Tensor, "d h w 2"]
     ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
-        """Pixels of positions in cells, and their inverse variances; zero where none is found."""
+        """Convert positions in cells to pixels and inverse variances; zero without a match."""
         pixels = (OFFSET + STRIDE * position).flatten(1, 2)
         confidence = confidence.flatten(1, 2)
         found = (confidence.mean(-1) > self.options.min_confidence) & self.grid.inside(pixels, 0.0)

@@ -1,8 +1,8 @@
 """The network of DROID-SLAM: encoders, recurrent update of an edge, aggregation over a frame.
 
 Teed and Deng, "DROID-SLAM: Deep Visual SLAM for Monocular, Stereo, and RGB-D Cameras", NeurIPS
-2021. Names of parameters and channels are those of the public weights, so that these load without
-translation. All positions are in cells of 1/8 of the image, x before y.
+2021. Names of parameters and channels are those of the public weights, so that these load
+unchanged. All positions are in cells of 1/8 of the image, x before y.
 """
 
 from collections.abc import Mapping
@@ -20,28 +20,28 @@ from geogs.world.grid import OFFSET, STRIDE
 LEVELS = 4
 """Levels of the correlation pyramid."""
 RADIUS = 3
-"""Cells around a position that are looked up on each level."""
+"""Radius in cells of a lookup window on each level."""
 LOOKUP = LEVELS * (2 * RADIUS + 1) ** 2
 """Channels of a lookup."""
 CORRELATION_SCALE = 1 / 16
 """Factor on the products of features."""
 MOTION_LIMIT = 64.0
-"""Cells at which the motion that is shown to the network is cut off."""
+"""Largest motion in the network's input, in cells."""
 DAMPING_SCALE = 0.01
 """Factor on the softplus that gives the damping."""
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Red, green and blue of the images that the public encoders were trained on, in [0, 1]."""
+"""Mean and deviation of red, green and blue of the public encoders' training images, in [0, 1]."""
 TRIMMED = tuple(
     f"update.{head}.2.{kind}" for head in ("weight", "delta") for kind in ("weight", "bias")
 )
-"""Parameters of which the public weights hold more outputs than the first two that are used."""
+"""Parameters with more outputs in the public weights than the first two, which are used."""
 
 
 def on_cells(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h8 w8"]:
-    """The part of images whose every eighth pixel is a cell of the sample grid.
+    """Crop images so that every eighth pixel is a cell of the sample grid.
 
-    Without their first four rows and columns; where the last cell has no eight pixels left, the
-    border goes on.
+    The first four rows and columns are removed; where the last cell has fewer than eight pixels,
+    the border is replicated.
     """
     # The last cell has at least three pixels after its own.
     rows, columns = (n // STRIDE * STRIDE for n in images.shape[2:])
@@ -51,13 +51,13 @@ def on_cells(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h8 w8"]:
 
 
 def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """RGB in [0, 1] as the encoders want it."""
+    """Normalise RGB in [0, 1] for the encoders."""
     mean, deviation = (images.new_tensor(c)[:, None, None] for c in (MEAN, DEVIATION))
     return (images - mean) / deviation
 
 
 class DroidResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut, which is a convolution where the size changes."""
+    """Two 3 x 3 convolutions with a shortcut, which is a convolution where the size changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, norm: bool) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class DroidEncoder(nn.Module):
 
 
 class ConvGru(nn.Module):
-    """A convolutional gated recurrent unit whose gates also see a mean over the whole image."""
+    """A convolutional gated recurrent unit whose gates also get a mean over the whole image."""
 
     def __init__(self, hidden: int, inputs: int) -> None:
         super().__init__()
@@ -124,10 +124,9 @@ class ConvGru(nn.Module):
 
 
 class GraphAggregation(nn.Module):
-    """Mean over the edges of a source frame, read out as damping of its depth.
+    """Mean over the edges of a source frame, decoded to the damping of its depth.
 
-    ``upmask``, the learned enlargement of depth, is kept for the public weights to load; nothing
-    here enlarges depth by it.
+    ``upmask``, the learned upsampling of depth, only exists for loading the public weights.
     """
 
     def __init__(self, hidden: int) -> None:
@@ -140,10 +139,10 @@ class GraphAggregation(nn.Module):
     def forward(
         self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]
     ) -> Float[Tensor, "n h w"]:
-        """Damping of inverse depth for each source, ascending; in the network's own units."""
+        """Return the damping of inverse depth of each source, ascending; in the network's units."""
         frames, place, count = source.unique(return_inverse=True, return_counts=True)
         edges = F.relu(self.conv1(hidden))
-        # A product, not scattered sums: always in the same order, summed in single precision.
+        # A product, not scattered sums: the order is fixed, and sums are in single precision.
         fraction = F.one_hot(place, len(frames)).mT / count[:, None]
         mean = (fraction.to(edges) @ edges.flatten(1)).unflatten(1, edges.shape[1:])
         joined = F.relu(self.conv2(mean))
@@ -156,16 +155,16 @@ class EdgeOutput:
 
     hidden: Float[Tensor, "e c h w"]
     delta: Float[Tensor, "e 2 h w"]
-    """Correction of the position that was looked up, in cells."""
+    """Correction of the looked-up position, in cells."""
     weight: Float[Tensor, "e 2 h w"]
     """Confidence of x and y in (0, 1)."""
 
 
 class UpdateOperator(nn.Module):
-    """The recurrent part: revises the flow of an edge from what lies around its present target."""
+    """The recurrent part: updates the flow of an edge from the correlation around its target."""
 
     def __init__(self, hidden: int, motion: int) -> None:
-        """Channels of the hidden state, and of the encoded motion."""
+        """Arguments: channels of the hidden state, and of the encoded motion."""
         super().__init__()
         self.corr_encoder = nn.Sequential(
             nn.Conv2d(LOOKUP, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 3, 1, 1), nn.ReLU()
@@ -208,13 +207,13 @@ class DroidNetwork(nn.Module):
         self.update = UpdateOperator(features, 2 * base)
 
     def features(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
-        """Matching features of images; RGB in [0, 1], sides divisible by 8."""
+        """Compute matching features of images; RGB in [0, 1], sides divisible by 8."""
         return self.fnet(normalised(images))
 
     def context(
         self, images: Float[Tensor, "n 3 h w"]
     ) -> tuple[Float[Tensor, "n c h8 w8"], Float[Tensor, "n c h8 w8"]]:
-        """Hidden state that an edge from the image starts with, and its static context."""
+        """Compute the initial hidden state of edges from the image, and its static context."""
         hidden, static = self.cnet(normalised(images)).chunk(2, 1)
         return hidden.tanh(), F.relu(static)
 
@@ -222,7 +221,7 @@ class DroidNetwork(nn.Module):
 def cell_positions(
     height: int, width: int, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "h w 2"]:
-    """x, y of every cell."""
+    """Return x, y of every cell."""
     y, x = torch.meshgrid(
         torch.arange(height, dtype=torch.float32, device=device),
         torch.arange(width, dtype=torch.float32, device=device),
@@ -234,7 +233,7 @@ def cell_positions(
 def motion_features(
     position: Float[Tensor, "e h w 2"], target: Float[Tensor, "e h w 2"]
 ) -> Float[Tensor, "e 4 h w"]:
-    """Flow at the present position, and how far that is from the last target; in cells."""
+    """Return the flow at the present position, and its offset to the last target; in cells."""
     height, width = position.shape[1:3]
     flow = position - cell_positions(height, width, position.device)
     both = torch.cat([flow, target - position], -1)
@@ -242,9 +241,9 @@ def motion_features(
 
 
 def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:
-    """The network with the public weights ``droid.pth``, ready to measure.
+    """Load the network with the public weights ``droid.pth``.
 
-    The names there begin with ``module.``, and the two heads have outputs that nothing uses.
+    The names there begin with ``module.``, and the two heads have unused outputs.
     """
     plain = {name.removeprefix("module."): value for name, value in state.items()}
     plain.update({name: plain[name][:2] for name in TRIMMED if name in plain})

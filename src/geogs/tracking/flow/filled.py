@@ -1,4 +1,4 @@
-"""Flow where there was no match: from the matches around."""
+"""Filling in of flow at unmatched cells from the matches around."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -9,11 +9,11 @@ from geogs.world.grid import SampleGrid
 
 
 def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
-    """Positions of a single edge, unmatched cells filled in from the flow around them."""
+    """Return positions of a single edge, unmatched cells filled in from the flow around them."""
     return grid.pixels + filled_flow(grid, match)
 
 
 def filled_flow(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
-    """Flow of a single edge, unmatched cells filled in from around them."""
+    """Return flow of a single edge, unmatched cells filled in from around them."""
     flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
     return grid_fields(grid).fill(flow.mT, weight.expand(2, -1)).mT.contiguous()

@@ -12,7 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.types import FlowMatch
 
 Memories = Sequence[tuple[Any, Any]]
-"""What the operator returned as memory of each pair's two directions; None for nothing."""
+"""Memory returned by the operator for each pair's two directions, or None."""
 
 
 def check_image_size(image: UInt8[np.ndarray, "h w 3"], camera: Camera) -> None:
@@ -29,15 +29,15 @@ class FlowOperator(Protocol):
     """Measures image motion between pairs of images, in both directions at once."""
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> Any:
-        """Whatever the operator keeps of an image; computed once per frame."""
+        """Encode an image for matching; computed once per frame."""
         ...
 
     def texture(self, encoded: Any) -> float:
-        """Fraction of the grid on which the image has enough structure to be matched."""
+        """Return the fraction of the grid on which the image has enough texture to be matched."""
         ...
 
     def grey(self, encoded: Any) -> Float[Tensor, "h w"]:
-        """The image in grey levels, 0 to 255, on the device of the grid."""
+        """Return the image in grey levels, 0 to 255, on the device of the grid."""
         ...
 
     def measure(
@@ -51,9 +51,9 @@ class FlowOperator(Protocol):
     ) -> tuple[FlowMatch, FlowMatch]:
         """Match ``first[e]`` with ``second[e]``; returns first -> second and second -> first.
 
-        ``forward`` and ``backward`` are the present estimates of the matched positions in pixels
-        (the reprojection, right to a few pixels); None means nothing is known (a cold start).
-        ``fine`` False allows a cheaper, less precise measurement. ``memory`` is what earlier
-        measurements of these pairs returned; operators without a memory ignore it.
+        ``forward`` and ``backward`` are initial estimates of the matched positions in pixels (the
+        reprojection, right to a few pixels); None for a cold start. ``fine`` False allows a
+        cheaper, less precise measurement. ``memory`` was returned by earlier measurements of these
+        pairs; operators without a memory ignore it.
         """
         ...

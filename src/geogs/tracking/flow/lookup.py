@@ -1,7 +1,7 @@
-"""Windows of correlation around where cells are believed to lie, without a correlation volume.
+"""Correlation windows around estimated positions of cells, without a correlation volume.
 
 Every cell of the first image has one descriptor; the second image has descriptors on a pyramid of
-grids, finer ones than the cells' included, so that a position can be read to a fraction of a pixel.
+grids, some finer than the cells, so that a position can be estimated to a fraction of a pixel.
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from geogs.threads import thread_map
 
 SOURCE = Path(__file__).parents[1] / "cuda" / "flow_lookup.cu"
 RADIUS = 3
-"""Descriptors to each side of a window's middle."""
+"""Radius of a window, in descriptors."""
 WINDOW = (2 * RADIUS + 1) ** 2
-"""Values of a window, row by row."""
+"""Number of values of a window, row by row."""
 CHANNELS = 64
-"""Numbers of a descriptor; the GPU's kernel gives each lane of a warp two."""
+"""Channels of a descriptor; in the GPU's kernel each lane of a warp has two."""
 _WARPS = 8
 
 
@@ -48,12 +48,12 @@ class DescriptorPyramid:
 
 @dataclass(frozen=True)
 class Edges:
-    """Which image is looked up in which."""
+    """Pairs of images: the first is looked up in the second."""
 
     first: Int[Tensor, "e"]
-    """int32."""
+    """Indices, int32."""
     second: Int[Tensor, "e"]
-    """int32."""
+    """Indices, int32."""
 
 
 def correlation_windows(
@@ -62,7 +62,7 @@ def correlation_windows(
     edges: Edges,
     centres: Float[Tensor, "e p 2"],
 ) -> Float[Tensor, "e p k"]:
-    """Dot products / sqrt(c) of each cell's descriptor with 7 x 7 descriptors at every level.
+    """Compute dot products / sqrt(c) of each cell's descriptor with 7 x 7 ones at every level.
 
     ``centres`` are pixels of the second image; windows are read bilinearly, zero outside. Channel
     ``49 l + 7 (dv + 3) + du + 3``. Differentiable in both descriptors (not in the centres).
@@ -80,7 +80,7 @@ def correlation_windows_reference(
     edges: Edges,
     centres: Float[Tensor, "e p 2"],
 ) -> Float[Tensor, "e p k"]:
-    """:func:`correlation_windows` the obvious way: sample the descriptors, multiply, add up."""
+    """Reference for :func:`correlation_windows`: sample the descriptors, multiply, sum."""
     d = torch.arange(-RADIUS, RADIUS + 1, dtype=centres.dtype, device=centres.device)
     dv, du = torch.meshgrid(d, d, indexing="ij")
     offsets = torch.stack([du, dv], -1).reshape(-1, 2)
@@ -91,7 +91,7 @@ def correlation_windows_reference(
         field = pyramid.descriptors[edges.second.long(), offset : offset + width * height]
         image = field.mT.reshape(len(field), -1, height, width)
         points = (centres * level.scale + level.shift)[:, :, None] + offsets
-        # One descriptor has no extent; any size but zero puts it in the middle.
+        # A single descriptor has no extent; any size but zero puts it in the middle.
         size = points.new_tensor([max(width - 1, 1), max(height - 1, 1)])
         window = functional.grid_sample(image, 2 * points / size - 1, align_corners=True)
         out.append(torch.einsum("epc,ecpk->epk", mine, window) / source.shape[-1] ** 0.5)
@@ -118,7 +118,7 @@ def _compiled_windows(
 
 
 class _CudaWindows(torch.autograd.Function):
-    """Forward and backward by the kernels; descriptors are read as bfloat16."""
+    """Forward and backward passes by the kernels; descriptors are read as bfloat16."""
 
     @staticmethod
     def forward(
@@ -160,7 +160,7 @@ class _CudaWindows(torch.autograd.Function):
 def level_tables(
     levels: tuple[PyramidLevel, ...],
 ) -> tuple[Int[np.ndarray, "l 3"], Float[np.ndarray, "l 2"]]:
-    """Offset, width and height of each level, int32; its factor and shift, float32."""
+    """Return offset, width and height of each level, int32; its factor and shift, float32."""
     sizes = [level.width * level.height for level in levels]
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     rows = [(o, v.width, v.height) for o, v in zip(offsets, levels, strict=True)]
@@ -170,11 +170,11 @@ def level_tables(
 
 @lru_cache(maxsize=8)
 def _tables_on(device: torch.device, levels: tuple[PyramidLevel, ...]) -> tuple[Tensor, Tensor]:
-    """The same on a device, copied there once."""
+    """Return the level tables on a device, copied there once."""
     table, scales = (torch.from_numpy(part).to(device) for part in level_tables(levels))
     return table, scales
 
 
 def _pairs(descriptors: Float[Tensor, "n q c"]) -> Int[Tensor, "n q c2"]:
-    """Descriptors rounded to bfloat16, two in an int32."""
+    """Round descriptors to bfloat16, two in an int32."""
     return descriptors.detach().to(torch.bfloat16).contiguous().view(torch.int32)

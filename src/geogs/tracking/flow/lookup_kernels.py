@@ -1,4 +1,4 @@
-"""The window lookup on the CPU, compiled."""
+"""Compiled window lookup on the CPU."""
 
 import numpy as np
 from numba import njit

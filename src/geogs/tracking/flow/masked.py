@@ -1,4 +1,4 @@
-"""A flow operator that matches nothing from and to pixels that are masked out."""
+"""A flow operator without matches from and to masked-out pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from geogs.world.grid import STRIDE, SampleGrid
 
 
 def valid_pixels(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Valid mask of an image that brings its own along: pixels masked out are black."""
+    """Return the valid mask of an image whose masked-out pixels are black."""
     return image.max(-1) > 0
 
 
@@ -26,7 +26,7 @@ class ValidMask:
     """Valid mask of an image; 1 and 0, on the device of the grid."""
 
     pixels: Float[Tensor, "h w"]
-    """Without what is nearer than a cell to pixels masked out: operators match patches."""
+    """Valid pixels at least a cell away from masked-out ones, as operators match patches."""
     cells: Float[Tensor, "p"]
 
     @property
@@ -37,14 +37,14 @@ class ValidMask:
 
 @dataclass(frozen=True, eq=False)
 class MaskedImage:
-    """An encoded image and what of it may be matched."""
+    """An encoded image and its valid mask."""
 
     encoded: Any
     valid: ValidMask
 
 
 class MaskedFlow:
-    """Another operator whose matches from and to what is masked out have no weight."""
+    """Wraps an operator; matches from and to masked-out pixels get no weight."""
 
     def __init__(
         self,
@@ -52,15 +52,15 @@ class MaskedFlow:
         grid: SampleGrid,
         mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """``mask``, of the size of the images, is true where all of them show the scene (a car's
-        bonnet, an arm, a time stamp are not); None where what is black in an image is masked out.
+        """``mask``, of the size of the images, is true where all of them show the scene (not a
+        car's bonnet, an arm, a time stamp); None masks out black pixels of each image.
 
         Raises InputError if it has another size, or hides all.
         """
         self._operator, self._device = operator, grid.device
         self._x, self._y = grid.pixels.long().unbind(-1)
         self.fixed: ValidMask | None = None
-        """The mask of all images."""
+        """Mask of all images."""
         if mask is None:
             return
         size = grid.camera.height, grid.camera.width
@@ -74,16 +74,16 @@ class MaskedFlow:
             raise InputError("The mask hides the whole image; it is bright where the scene is.")
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> MaskedImage:
-        """The operator's form of an image, with what is valid."""
+        """Encode an image, with its valid mask."""
         valid = self.fixed or self._valid(valid_pixels(image))
         return MaskedImage(self._operator.encode(image), valid)
 
     def texture(self, encoded: MaskedImage) -> float:
-        """The operator's, at most the fraction of cells that are valid."""
+        """Return the textured fraction, at most the fraction of valid cells."""
         return min(self._operator.texture(encoded.encoded), encoded.valid.fraction)
 
     def grey(self, encoded: MaskedImage) -> Float[Tensor, "h w"]:
-        """The operator's."""
+        """Return the image in grey levels."""
         return self._operator.grey(encoded.encoded)
 
     def measure(
@@ -95,7 +95,7 @@ class MaskedFlow:
         fine: bool = True,
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
-        """The operator's matches, without what is masked out."""
+        """Return the operator's matches, without masked-out pixels."""
         a, b = ([image.encoded for image in side] for side in (first, second))
         there, back = self._operator.measure(a, b, forward, backward, fine, memory)
         return self._masked(there, first, second), self._masked(back, second, first)

@@ -1,4 +1,4 @@
-"""Which flow operator the tracker uses."""
+"""Choice of the tracker's flow operator."""
 
 from dataclasses import replace
 
@@ -18,11 +18,11 @@ def build_operator(
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
 ) -> FlowOperator:
-    """The operator that the configuration names, with its weights, for the device of a grid.
+    """Build the configured operator, with its weights, for the device of a grid.
 
-    Outside a ``mask``, true where all images show the scene, nothing is matched; nor is what is
-    black in an image where ``black_is_masked``. Raises InputError if weights are needed and none
-    are found or they do not fit, or if the mask does not fit.
+    Pixels outside a ``mask``, true where all images show the scene, are not matched, nor black ones
+    with ``black_is_masked``. Raises InputError if weights are needed and none are found or they do
+    not fit, or if the mask does not fit.
     """
     operator = _operator(config, grid)
     if mask is not None:
@@ -31,7 +31,7 @@ def build_operator(
 
 
 def operator_found(config: TrackingConfig) -> str | None:
-    """Which operator ``droid_if_found`` comes to, and why; None where another one is named."""
+    """Describe the operator chosen by ``droid_if_found``, and why; None for other settings."""
     if config.operator != "droid_if_found":
         return None
     found = _resolved(config)
@@ -45,7 +45,7 @@ def operator_found(config: TrackingConfig) -> str | None:
 
 
 def _resolved(config: TrackingConfig) -> TrackingConfig:
-    """The configuration with an operator that does not depend on which files are there."""
+    """Replace ``droid_if_found`` by the operator for which files exist."""
     if config.operator != "droid_if_found":
         return config
     weights = config.weights or located("droid")
@@ -70,7 +70,7 @@ def _operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
 
 
 def _classical(grid: SampleGrid) -> FlowOperator:
-    """The operator without a network."""
+    """Return the operator without a network."""
     if grid.on_gpu:
         from geogs.tracking.flow.classical_flow_cuda import CudaClassicalFlow
 

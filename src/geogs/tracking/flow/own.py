@@ -1,4 +1,4 @@
-"""The flow operator that is trained for this system (``geogs train flow``)."""
+"""The flow operator with a network trained for this system (``geogs train flow``)."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -24,52 +24,53 @@ from geogs.world.grid import SampleGrid
 
 @dataclass(frozen=True)
 class OwnFlowOptions:
-    """How the network is run."""
+    """Options of running the network."""
 
     warm_iterations: int = 4
     """Iterations from a start that is right to a few pixels."""
     coarse_iterations: int = 3
-    """The same where a cheaper measurement will do."""
+    """Iterations of a cheaper measurement from such a start."""
     cold_iterations: int = 8
-    """Iterations from what the classical operator finds where nothing is known."""
+    """Iterations from the classical operator's flow, where there is no start."""
     min_probability: float = 0.5
-    """A cell that is matched with less probability has no weight."""
+    """Least probability of a match for a cell to have any weight."""
     max_deviation: float = 2.0
-    """A cell whose flow may be off by more pixels has none, either."""
+    """Largest deviation in pixels of a cell's flow for it to have any weight."""
     max_correction: float = 6.0
-    """Pixels by which a cell may move away from a warm start more than the median cell does; a
-    jump of one period of a pattern that repeats is larger."""
+    """Largest motion in pixels of a cell from a warm start relative to the median cell's; a jump by
+    one period of a repetitive pattern is larger."""
     inflation: float = 100.0
-    """Deviation in the adjustment over that of a single match: the errors of a cell are alike in
-    all its edges and those of neighbouring cells are alike, too; the adjustment takes them for
-    independent. Measured: less trust keeps the polished cells in charge."""
+    """Deviation in the adjustment over that of a single match: errors of a cell are correlated over
+    its edges and with those of neighbours, but the adjustment assumes them to be independent.
+    Measured: with larger deviations the refined cells dominate."""
     floor: float = 0.04
-    """Deviation in pixels that no match goes below."""
+    """Least deviation of a match, pixels."""
     polish: bool = True
     """Whether the classical operator refines the network's flow."""
     agreement: float = 3.0
-    """Standard deviations by which both may differ to be joined; else the network is believed."""
+    """Largest difference of the two, in standard deviations, for averaging; else the network's flow
+    is used."""
     edges_at_once: int = 64
     """Directed pairs that are in memory together."""
 
 
 @dataclass(frozen=True)
 class OwnImage:
-    """An image as the network keeps it, on the device of the grid."""
+    """An image encoded by the network, on the device of the grid."""
 
     features: FlowFeatures
     """Features of one image."""
     classical: Any
-    """The classical operator's form of it."""
+    """The image encoded by the classical operator."""
 
 
 class OwnFlow:
     """The network on one grid; bfloat16 inside, positions float32.
 
-    The classical operator helps twice. Where nothing is known of a motion it makes the start: on
-    patterns that repeat its coarse levels find the right one of many places that look alike, where
-    windows of correlation see the nearest. And it polishes: begun at the network's flow it is more
-    precise where there is texture, so both are joined by their variances where they agree.
+    The classical operator is used twice. It gives the start of unknown motions: on repetitive
+    patterns its coarse levels find the right one of many similar positions, while correlation
+    windows find the nearest. And it refines: started from the network's flow it is more precise on
+    texture, so both are averaged by their variances where they agree.
     """
 
     def __init__(
@@ -86,10 +87,10 @@ class OwnFlow:
         self.device = torch.device(grid.device)
         network = load_flow_network(weights)
         network.to(self.device)
-        # PyTorch's stubs do not know the memory format.
+        # PyTorch's stubs lack the memory format.
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._levels: tuple[PyramidLevel, ...] = ()
-        """Pyramid levels of every image, known from the first on."""
+        """Pyramid levels of every image, set by the first one."""
         self._encoded = Recorded(self._features, "The flow network")
         self._refined = functools.cache(self._refinement)
 
@@ -103,7 +104,7 @@ class OwnFlow:
         return OwnImage(features, self.classical.encode(image))
 
     def _features(self, pixels: UInt8[Tensor, "h w 3"]) -> Maps:
-        """Features of an image."""
+        """Compute the features of an image."""
         with self._autocast():
             found = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
         self._levels = found.pyramid.levels
@@ -136,7 +137,7 @@ class OwnFlow:
         else:
             start = torch.cat([forward, backward]).float()
             iterations = options.warm_iterations if fine else options.coarse_iterations
-        # One pair is what each frame asks for; of more there are many numbers.
+        # Each frame measures one pair; larger numbers of pairs vary.
         refined = self._refined(iterations, is_warm, pairs == 1)
         f = _stack([i.features for i in images])
         source, target = (
@@ -157,9 +158,9 @@ class OwnFlow:
         return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
 
     def _refinement(self, iterations: int, is_warm: bool, is_recorded: bool) -> Callable[..., Maps]:
-        """The function from some edges' starts to their positions and weights.
+        """Return the function from some edges' starts to their positions and weights.
 
-        Its arguments are the features of images but for the levels, the two images of each edge,
+        Its arguments are the features of images without the levels, the two images of each edge,
         and the start of each.
         """
 
@@ -178,7 +179,7 @@ class OwnFlow:
     def _cold_start(
         self, first: Sequence[OwnImage], second: Sequence[OwnImage]
     ) -> Float[Tensor, "d p 2"]:
-        """The classical flow of both directions, its gaps filled; no motion where it has none."""
+        """Return the classical flow of both directions with gaps filled; zero without any match."""
         a, b = ([i.classical for i in side] for side in (first, second))
         matches = self.classical.measure(a, b, fine=False)
         starts = []
@@ -198,10 +199,10 @@ class OwnFlow:
         fine: bool,
         is_warm: bool,
     ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
-        """The network's flow joined with the classical flow that begins there.
+        """Average the network's flow with the classical flow that starts from it.
 
-        From a cold start what the classical flow does not confirm has no weight: where neither
-        knows the motion, as in front of a car, the network is confident of what is merely alike.
+        From a cold start, flow not confirmed by the classical flow has no weight: where neither
+        finds the motion, as in front of a car, the network is confident of mere similarity.
         """
         a, b = ([i.classical for i in side] for side in (first, second))
         matches = self.classical.measure(a, b, pixels[: len(a)], pixels[len(a) :], fine)
@@ -219,8 +220,8 @@ class OwnFlow:
     def _weight(
         self, estimate: FlowEstimate, start: Float[Tensor, "e p 2"] | None
     ) -> Float[Tensor, "e p 2"]:
-        """Inverse variance of matched cells; none where a match is unlikely or leaves the image,
-        or goes elsewhere than the others from a warm start."""
+        """Return the inverse variance of matched cells; zero where a match is unlikely, outside the
+        image, or moves differently from the others after a warm start."""
         options, error = self.options, estimate.error
         deviation = 2**0.5 * error.log_scale.exp().amax(-1)
         good = (deviation < options.max_deviation) & self.grid.inside(estimate.pixels)
@@ -237,7 +238,7 @@ class OwnFlow:
 
 
 def _stack(parts: Sequence[FlowFeatures]) -> FlowFeatures:
-    """Features of several images as one."""
+    """Concatenate the features of several images."""
     if len(parts) == 1:
         return parts[0]
     descriptors = torch.cat([p.pyramid.descriptors for p in parts])

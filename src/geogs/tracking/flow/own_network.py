@@ -1,9 +1,9 @@
 """Our recurrent flow network for static scenes and dense bundle adjustment.
 
-It starts from the flow that poses and depths predict, looks the cells' descriptors up around where
-they are believed to lie, and iterates (after RAFT and DROID-SLAM). Every iteration says how far its
-flow may be off: each axis has a mixture of two Laplace distributions (after SEA-RAFT), one for
-cells that are matched and one for cells that are not.
+It starts from the flow predicted by poses and depths, looks up the cells' descriptors around their
+estimated positions, and iterates (after RAFT and DROID-SLAM). Every iteration estimates the error
+of its flow: each axis has a mixture of two Laplace distributions (after SEA-RAFT), one for matched
+cells and one for unmatched cells.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ from geogs.tracking.flow.own_options import NetworkOptions
 from geogs.world.grid import OFFSET, STRIDE
 
 FLOW_UNIT = 16.0
-"""Pixels of flow that are one to the network."""
+"""Pixels per unit of flow in the network."""
 MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
 """Bounds of the logarithm of a matched cell's Laplace scale in pixels."""
 
@@ -41,33 +41,33 @@ class FlowFeatures:
     """Descriptors of the cells."""
     pyramid: DescriptorPyramid
     hidden: Float[Tensor, "n ch gh gw"]
-    """State that the iterations begin with."""
+    """Initial state of the iterations."""
     context: Float[Tensor, "n cx gh gw"]
 
 
 @dataclass(frozen=True)
 class LaplaceMixture:
-    """Error of a flow along each axis: matched with probability ``logit``, else not."""
+    """Error of a flow along each axis: of a matched or an unmatched cell."""
 
     logit: Float[Tensor, "e p 1"]
     """Logit of the probability that a cell is matched."""
     log_scale: Float[Tensor, "e p 2"]
     """Logarithm of the Laplace scale in pixels of a matched cell."""
     log_outlier: Float[Tensor, "e p 2"]
-    """The same of a cell that is not matched; larger."""
+    """The same for an unmatched cell; larger."""
 
     def variance(self) -> Float[Tensor, "e p 2"]:
-        """Variance of the whole mixture, pixels^2 (a Laplace distribution of scale b has 2 b^2)."""
+        """Return the variance of the mixture, pixels^2 (2 b^2 for a Laplace scale b)."""
         p = self.logit.sigmoid()
         return 2 * (p * (2 * self.log_scale).exp() + (1 - p) * (2 * self.log_outlier).exp())
 
     def weight(self, floor: float) -> Float[Tensor, "e p 2"]:
-        """Weight of a flow in an adjustment, 1 / pixel^2: the probability that the cell is
-        matched, over the variance that it then has; ``floor`` is a deviation in pixels."""
+        """Return the weight of a flow in an adjustment, 1 / pixel^2: the probability of a match
+        over its variance; ``floor`` is a deviation in pixels."""
         return self.logit.sigmoid() / (2 * (2 * self.log_scale).exp() + floor**2)
 
     def negative_log_likelihood(self, error: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p"]:
-        """Negative log-likelihood of errors in pixels, mean over both axes."""
+        """Return the negative log-likelihood of errors in pixels, mean over both axes."""
         parts = []
         for logit, log_scale in ((self.logit, self.log_scale), (-self.logit, self.log_outlier)):
             density = -error.abs() * (-log_scale).exp() - log_scale - 0.693147
@@ -86,7 +86,7 @@ class FlowEstimate:
 
 
 class FlowNetwork(nn.Module):
-    """FlowEncoder, recurrent update, heads and convex upsampling."""
+    """The network: encoder, recurrent update, heads and convex upsampling."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class FlowNetwork(nn.Module):
         )
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> FlowFeatures:
-        """Features of RGB images in [0, 1], on the cells of :class:`SampleGrid`."""
+        """Compute features of RGB images in [0, 1], on the cells of :class:`SampleGrid`."""
         return self.encoder(images)
 
     def iterate(
@@ -110,9 +110,9 @@ class FlowNetwork(nn.Module):
         start: Float[Tensor, "e p 2"],
         iterations: int,
     ) -> Iterator[FlowEstimate]:
-        """Estimates of where the cells of each edge's first image lie in its second, in pixels.
+        """Yield estimates of the positions of each edge's first cells in its second image, pixels.
 
-        ``start`` is what is known before. Positions are detached between iterations.
+        ``start``: initial positions. Positions are detached between iterations.
         """
         first = edges.first.long()
         state, context = features.hidden[first], features.context[first]
@@ -134,7 +134,7 @@ class FlowNetwork(nn.Module):
             yield FlowEstimate(pixels, error, state)
 
     def upsample(self, estimate: FlowEstimate, height: int, width: int) -> Float[Tensor, "e h w 2"]:
-        """Flow of every pixel as a convex combination of the flows of the nine cells around it."""
+        """Upsample flow to pixels by convex combinations of the nine cells around each."""
         state = estimate.state
         gh, gw = state.shape[-2:]
         flow = estimate.pixels - cell_pixels(gh, gw, estimate.pixels)
@@ -151,12 +151,12 @@ class FlowNetwork(nn.Module):
 
 
 def load_flow_network(path: Path) -> FlowNetwork:
-    """The network of a weights file; raises InputError where it is missing or another's."""
+    """Load the network from a weights file; raises InputError if it is missing or another's."""
     return load_trained(path, "flow", lambda about: FlowNetwork(NetworkOptions(**about["options"])))
 
 
 class FlowEncoder(nn.Module):
-    """One trunk for descriptors and context, so that an image is read once.
+    """One trunk for descriptors and context, so that an image is encoded once.
 
     Pixel of a position i: 2 i at 1/2, 4 i at 1/4, 4 + 8 i at 1/8, where the cells are.
     """
@@ -221,7 +221,7 @@ class FlowEncoder(nn.Module):
 
 
 class FlowResidual(nn.Module):
-    """Two convolutions beside a shortcut; ``shift`` halves the resolution.
+    """Two convolutions with a shortcut; ``shift`` halves the resolution.
 
     Output i of a halving block is at input 2 i + 1 - shift.
     """
@@ -270,7 +270,7 @@ class FlowUpdate(nn.Module):
         self, state: Tensor, context: Tensor, windows: Tensor, flow: Tensor
     ) -> tuple[Tensor, Tensor]:
         x = torch.cat([context, self.windows(windows), self.flow(flow)], 1)
-        # What the whole view says, as in DROID-SLAM: a weighted mean of the state.
+        # Global context, as in DROID-SLAM: a weighted mean of the state.
         mean = (self.view(state).sigmoid() * state).mean((2, 3))
         gate_bias, candidate_bias = self.view_to_gates(mean)[..., None, None].split(
             [2 * state.shape[1], state.shape[1]], 1
@@ -283,7 +283,7 @@ class FlowUpdate(nn.Module):
 
 
 def cell_pixels(height: int, width: int, like: Tensor) -> Float[Tensor, "p 2"]:
-    """Pixels of the sample grid's cells, row by row."""
+    """Return the pixels of the sample grid's cells, row by row."""
     x = OFFSET + STRIDE * torch.arange(width, dtype=like.dtype, device=like.device)
     y = OFFSET + STRIDE * torch.arange(height, dtype=like.dtype, device=like.device)
     yy, xx = torch.meshgrid(y, x, indexing="ij")
@@ -297,15 +297,15 @@ def _mixture(values: Float[Tensor, "e p k"]) -> LaplaceMixture:
 
 
 def _descriptors(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    """Descriptors of one length: a perfect match correlates by sqrt(c), a random one by 0."""
+    """Normalise descriptors: a perfect match correlates by sqrt(c), a random one by 0."""
     return CHANNELS**0.5 * functional.normalize(x.float(), dim=1)
 
 
 def _pyramid(fields: dict[int, Tensor]) -> DescriptorPyramid:
-    """Levels by the pixels between their descriptors; those above 1/4 are means of 2 x 2."""
+    """Build the levels, by stride in pixels; those above 4 are repeated means of 2 x 2."""
     levels = []
     for stride, field in fields.items():
-        # A mean of k x k descriptors at 4 i lies (k - 1) / 2 of them further on.
+        # A mean of k x k descriptors at 4 i is centred (k - 1) / 2 of them further on.
         shift = 0.0 if stride <= 4 else (4 / stride - 1) / 2
         levels.append(PyramidLevel(field.shape[-1], field.shape[-2], 1 / stride, shift))
     flat = torch.cat([field.flatten(2).mT for field in fields.values()], 1)
@@ -313,12 +313,12 @@ def _pyramid(fields: dict[int, Tensor]) -> DescriptorPyramid:
 
 
 def _image(values: Float[Tensor, "e p k"], height: int) -> Float[Tensor, "e k h w"]:
-    """Values of cells as an image; the channels stay innermost in memory."""
+    """Reshape values of cells to an image; the channels stay innermost in memory."""
     return values.unflatten(1, (height, -1)).permute(0, 3, 1, 2)
 
 
 def _replicated(x: Tensor, pad: tuple[int, ...]) -> Tensor:
-    """Padding that repeats the last value, also of integers and of channels-last fields."""
+    """Pad by replication, also integers and channels-last fields."""
     for axis, (before, after) in enumerate(zip(pad[::2], pad[1::2], strict=True)):
         dim = x.dim() - 1 - axis
         parts = [x.narrow(dim, 0, 1).expand(*_times(x, dim, before))] if before else []
@@ -334,5 +334,5 @@ def _times(x: Tensor, dim: int, count: int) -> list[int]:
 
 
 def _norm(channels: int) -> nn.Module:
-    """Free of the batch, and of gain and offset of the image's light."""
+    """Return a norm independent of the batch, and of gain and offset of the exposure."""
     return nn.InstanceNorm2d(channels, affine=True)

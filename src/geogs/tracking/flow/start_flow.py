@@ -1,11 +1,10 @@
-"""Flow that is known at the cells of the grid, between them: by what the second image is warped.
+"""Interpolation between the grid's cells of the known flow, by which the second image is warped.
 
-Straight lines between cells are not enough. The flow of a plane that is seen at a slant, as of a
-road, bends within the eight pixels from one cell to the next by up to a pixel, always to the same
-side, and what is measured on top of it is a smooth flow, which takes the mean of that for motion:
-along a street matches of the ground were too short by a tenth to a third of a pixel, and the scale
-of the path drifted. So the interpolant is quadratic, in one step from linear, and stays linear
-where the flow jumps or has a kink.
+Linear interpolation is not enough. The flow of a slanted plane, such as a road, is curved within
+the eight pixels from one cell to the next, by up to a pixel and always to the same side. The flow
+measured on top of it is smooth and would include the mean of that: along a street matches of the
+ground were too short by a tenth to a third of a pixel, and the scale of the path drifted. So the
+interpolant is quadratic, and stays linear where the flow jumps or has a kink.
 """
 
 import cv2
@@ -18,9 +17,9 @@ class StartFlow:
 
     ``f(u, v) = linear - a (1 - a) / 2 X - b (1 - b) / 2 Y``, a and b being the fractions of the way
     from one cell to the next along u and v. X and Y are second differences along the two, each the
-    smaller one of the cells at both ends, none if their signs differ (minmod): what is quadratic
-    along either axis is exact, and a step never overshoots. Source: the limited reconstructions of
-    Harten et al. 1987 (ENO).
+    smaller one of the cells at both ends, zero if their signs differ (minmod): it is exact for
+    quadratics along either axis, and never overshoots at a step. Source: the limited
+    reconstructions of Harten et al. 1987 (ENO).
     """
 
     def __init__(self, flow: Float[np.ndarray, "r c 2"]) -> None:
@@ -28,17 +27,17 @@ class StartFlow:
         self._bend_u, self._bend_v = _limited_bend(self._flow, 1), _limited_bend(self._flow, 0)
 
     def on(self, lattice: "Lattice") -> Float32[np.ndarray, "h w 2"]:
-        """Flow at all points of a lattice that is made for such a grid."""
+        """Interpolate at all points of a lattice made for this grid."""
         x, height = lattice, len(lattice.u)
         found = bilinear(self._flow, x.u, x.v)
-        # Both numbers of a row behind each other: NumPy is slow on axes of two.
+        # Both components of a row in one axis: NumPy is slow on axes of two.
         flat = found.reshape(height, -1)
         flat -= x.factor_u * bilinear(self._bend_u, x.cell_u, x.v).reshape(height, -1)
         flat -= x.factor_v * bilinear(self._bend_v, x.u, x.cell_v).reshape(height, -1)
         return found
 
     def at(self, points: Float[np.ndarray, "p 2"]) -> Float32[np.ndarray, "p 2"]:
-        """Flow at some points, in cells. The border is repeated."""
+        """Interpolate at some points, in cells. The border is replicated."""
         rows, columns = self._flow.shape[:2]
         i, a = _cells(points[:, 0].astype(np.float32), columns)
         j, b = _cells(points[:, 1].astype(np.float32), rows)
@@ -55,7 +54,7 @@ class StartFlow:
 
 
 class Lattice:
-    """Columns u and rows v, in cells of a grid, with what interpolants at all of them need."""
+    """Columns u and rows v, in cells of a grid, with precomputed data for interpolation."""
 
     def __init__(
         self,
@@ -64,7 +63,7 @@ class Lattice:
         rows: int,
         columns: int,
     ) -> None:
-        """Places are multiples of 1/32, to which OpenCV rounds; the grid has so many cells."""
+        """Positions are multiples of 1/32, to which OpenCV rounds; ``rows``, ``columns``: cells."""
         self.u, self.v = np.meshgrid(u, v)
         cell, fraction = _cells(u, columns)
         self.cell_u = np.meshgrid(cell, v)[0]
@@ -75,19 +74,19 @@ class Lattice:
 
 
 def _cells(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The cell before each point, and the fraction of the way to the next."""
+    """Return the cell before each point, and the fraction of the way to the next."""
     x = np.clip(x, 0, count - 1)
     cell = np.minimum(np.floor(x), count - 2)
     return cell, x - cell
 
 
 def _limited_bend(flow: Float32[np.ndarray, "r c 2"], axis: int) -> Float32[np.ndarray, "r c 2"]:
-    """Second difference between each cell and the next along an axis; of the last one, none."""
+    """Return second differences between each cell and the next along an axis; zero for the last."""
     bend = np.zeros_like(flow)
     if flow.shape[axis] < 3:
         return bend
     second = np.diff(flow, 2, axis)
-    # At the border the only one there is counts.
+    # At the border there is only one.
     both = np.concatenate([second.take([0], axis), second, second.take([-1], axis)], axis)
     first, last = (both.take(range(k, k + flow.shape[axis] - 1), axis) for k in (0, 1))
     smaller = np.where(np.abs(first) < np.abs(last), first, last)
@@ -97,5 +96,5 @@ def _limited_bend(flow: Float32[np.ndarray, "r c 2"], axis: int) -> Float32[np.n
 
 
 def bilinear(field: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Values of a field at columns and rows; beyond its border, those there."""
+    """Interpolate a field at columns and rows bilinearly; the border is replicated."""
     return cv2.remap(field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -12,17 +12,17 @@ _ZERO, _WHITE = np.float32(0.0), np.float32(255.0)
     cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
 )  # fmt: skip
 def warp(image, x, y, warped):
-    """Fill ``warped`` (uint8, of the shape of ``x``) with what ``image`` (uint8, h w) shows at
-    columns ``x`` and rows ``y`` (float32), beyond its border what that shows.
+    """Fill ``warped`` (uint8, of the shape of ``x``) with ``image`` (uint8, h w) interpolated at
+    columns ``x`` and rows ``y`` (float32); the border is replicated.
 
-    By cubic convolution (Keys 1981, a = -1/2), which keeps a slope. OpenCV's (a = -3/4) does not:
-    it shows things up to 0.04 pixels beside their place, and flow follows.
+    By cubic convolution (Keys 1981, a = -1/2), which preserves a slope. OpenCV's (a = -3/4) does
+    not: it shifts image content by up to 0.04 pixels, and flow follows.
     """
     bottom, right = image.shape[0] - 1, image.shape[1] - 1
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
             u, v = x[row, column], y[row, column]
-            u, v = u if u > -_TWO else -_TWO, v if v > -_TWO else -_TWO  # what is no number, too
+            u, v = u if u > -_TWO else -_TWO, v if v > -_TWO else -_TWO  # NaN, too
             u, v = min(u, np.float32(right + 2)), min(v, np.float32(bottom + 2))
             left, top = np.floor(u), np.floor(v)
             t = u - left

@@ -1,4 +1,4 @@
-"""Notes along the way what every frame can be placed by once the keyframes are final."""
+"""Recording of the data by which every frame is located once the keyframes are final."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -19,18 +19,18 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
 MAX_WAITING = 64
-"""Frames whose images wait for keyframes to become final."""
+"""Most frames whose images wait for keyframes to become final."""
 MEASURED_TOGETHER = 8
-"""Pairs of a frame and a keyframe."""
+"""Pairs of a frame and a keyframe measured at a time."""
 MAX_ROTATIONS, ROTATION_THREADS = 16, 4
-"""Frames whose rotations are measured while others come, and by how many threads."""
+"""Most rotations of frames measured in the background, and number of threads."""
 
 
 class FrameRecorder:
     """Keeps the log of a segment's frames.
 
-    Images wait only until the keyframes around them are safe from culling; then the flow from both
-    is measured and every second cell of it is kept.
+    Images wait only until the keyframes around them are final; then the flow from both is measured
+    and every second cell of it is kept.
     """
 
     def __init__(self, frames: FrameLog, keyframes: KeyframeSet, operator: FlowOperator) -> None:
@@ -43,23 +43,23 @@ class FrameRecorder:
 
     @property
     def log(self) -> FrameLog:
-        """All frames, once all their rotations have been measured."""
+        """All frames, after waiting for the measurement of their rotations."""
         self._await_rotations(0)
         return self._log
 
     def note_rows(self, frame: Frame) -> None:
-        """Note how the rows of a frame were rectified, whatever becomes of it."""
+        """Record how the rows of a frame were rectified, whether it is tracked or not."""
         if frame.rows is not None and frame.rows.is_rectified:
             self._log.rows[frame.index] = frame.rows
         else:
             self._log.open_rows = frame.rows
 
-    # --- frames as they come ---------------------------------------------------------------
+    # --- new frames ------------------------------------------------------------------------
 
     def add_untracked(
         self, index: int, timestamp: float, rotations: Sequence[RelativeRotation] = ()
     ) -> None:
-        """A frame that could not be located, though its orientation may be known."""
+        """Add a frame that could not be located, though its orientation may be known."""
         eye = torch.eye(4, dtype=torch.float64)
         record = FrameRecord(index, timestamp, None, eye, rotations=[*rotations])
         self._log.records.append(record)
@@ -73,7 +73,7 @@ class FrameRecorder:
         match: FlowMatch | None = None,
         rotations: Sequence[RelativeRotation] = (),
     ) -> None:
-        """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
+        """Add a frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
         record = FrameRecord(
             frame.index, frame.timestamp, anchor, T_rel, self._keyframes[anchor].scale,
             rotations=[*rotations], image=frame.image, encoded=encoded,
@@ -86,7 +86,7 @@ class FrameRecorder:
             self._stop_waiting(self._waiting[: MAX_WAITING // 2])
 
     def add_keyframe(self, keyframe: Keyframe, rotations: Sequence[RelativeRotation] = ()) -> None:
-        """A frame that is a keyframe."""
+        """Add a frame that is a keyframe."""
         eye = torch.eye(4, dtype=torch.float64)
         record = FrameRecord(
             keyframe.frame_index, keyframe.timestamp, keyframe.id, eye, keyframe.scale,
@@ -95,19 +95,19 @@ class FrameRecorder:
         self._log.records.append(record)
 
     def measure_rotation(self, measure: Callable[[], RelativeRotation | None]) -> None:
-        """Have another rotation of the latest frame measured by a thread while others come."""
+        """Measure another rotation of the latest frame in a background thread."""
         self._rotations.append((self._log.records[-1], self._threads.submit(measure)))
         self._await_rotations(MAX_ROTATIONS)
 
     def _await_rotations(self, most: int) -> None:
-        """Wait until no more rotations than that are being measured."""
+        """Wait until at most that many rotations are being measured."""
         while len(self._rotations) > most:
             record, measured = self._rotations.popleft()
             found = measured.result()
             if found is not None:
                 record.rotations.insert(0, found)
 
-    # --- what becomes of them --------------------------------------------------------------
+    # --- changes of earlier frames ---------------------------------------------------------
 
     def keyframe_removed(self, removed: Keyframe, substitute: int) -> None:
         """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
@@ -125,36 +125,36 @@ class FrameRecorder:
                     self._let_wait(record, removed)
 
     def keyframe_forgotten(self, removed: Keyframe) -> None:
-        """Keep the image of a keyframe that was given up, as that of a frame without a pose."""
+        """Keep the image of a dropped keyframe, as that of a frame without a pose."""
         record = next((r for r in self.log.records if r.index == removed.frame_index), None)
         if record is not None:
             self._let_wait(record, removed)
 
     def keyframe_restored(self, record: FrameRecord, keyframe: Keyframe) -> None:
-        """A frame whose keyframe was given up is one again."""
+        """Make a frame whose keyframe was dropped a keyframe again."""
         eye = torch.eye(4, dtype=torch.float64)
         record.anchor, record.T_rel, record.scale = keyframe.id, eye, keyframe.scale
         record.observations = []
         self._stop_waiting([record])
 
     def unplaced(self) -> list[FrameRecord]:
-        """Frames that wait without a keyframe to be relative to, earliest first."""
+        """Return waiting frames without an anchor keyframe, earliest first."""
         ids = {*self._keyframes.ids}
         return [r for r in self._waiting if r.anchor not in ids]
 
     def place(
         self, record: FrameRecord, anchor: int, T_rel: Float[Tensor, "4 4"], match: FlowMatch
     ) -> None:
-        """Say where a frame is after all, with the flow that located it."""
+        """Set the pose of a frame, with the flow that located it."""
         record.anchor, record.T_rel, record.scale = anchor, T_rel, self._keyframes[anchor].scale
         record.observations = []
         self._observe([(record, anchor)], match)
 
     def place_found(self, found: FoundFrames, others: Sequence["FrameRecorder"]) -> None:
-        """Place frames that were found after the stream, beside those that tracking placed.
+        """Set the poses of frames that were relocalised after the stream.
 
-        Each is relative to the keyframe nearest in time, with nothing to be solved by; frames in
-        the logs of ``others`` are taken over.
+        Each is relative to the keyframe nearest in time, without matches; frames in the logs of
+        ``others`` are taken over.
         """
         poses = dict(zip(found.numbers, torch.from_numpy(found.T_cw), strict=True))
         for other in others:
@@ -198,7 +198,7 @@ class FrameRecorder:
         self._stop_waiting(ready)
 
     def _let_wait(self, record: FrameRecord, keyframe: Keyframe) -> None:
-        """Keep the image of a frame that is a keyframe no longer."""
+        """Keep the image of a frame that is no longer a keyframe."""
         record.image, record.encoded = keyframe.image, keyframe.encoded
         self._waiting = _in_order([*self._waiting, record])
 
@@ -208,7 +208,7 @@ class FrameRecorder:
         self._waiting = [r for r in self._waiting if r.image is not None]
 
     def encoded(self, record: FrameRecord) -> Any:
-        """The flow operator's form of the image of a frame that waits."""
+        """Return the encoded image of a waiting frame."""
         if record.encoded is None:
             assert record.image is not None, "a frame that does not wait has no image"
             record.encoded = self._operator.encode(record.image)
@@ -228,23 +228,23 @@ class FrameRecorder:
         self._observe(jobs, there)
 
     def _observe(self, jobs: list[tuple[FrameRecord, int]], match: FlowMatch) -> None:
-        """Keep the matches of records with keyframes."""
+        """Store the matches of records with keyframes."""
         pixels, weight = match.pixels[:, self._cells], match.weight[:, self._cells]
         position, half_weight = pack_matches(self._keyframes.grid, pixels, weight)
         for n, (record, keyframe) in enumerate(jobs):
-            # Asking would wait for the GPU; an observation without weight does no harm.
+            # The test would wait for the GPU; an observation without weight does no harm.
             if self._keyframes.grid.on_gpu or bool((weight[n] > 0).any()):
                 record.observations.append(Observation(keyframe, position[n], half_weight[n]))
 
 
 def pose_of(record: FrameRecord, keyframes: KeyframeSet) -> Float[Tensor, "4 4"]:
-    """World to camera of a frame by the present pose and scale of its anchor."""
+    """Return world to camera of a frame by the present pose and scale of its anchor."""
     assert record.anchor is not None, "a frame that was not tracked has no pose"
     return record.T_cw(keyframes[record.anchor])
 
 
 def sparse_cells(grid: SampleGrid) -> Int[Tensor, "s"]:
-    """Indices of every second cell in both directions."""
+    """Return the indices of every second cell in both directions."""
     keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
     keep[::2, ::2] = True
     return torch.nonzero(keep.reshape(-1))[:, 0]

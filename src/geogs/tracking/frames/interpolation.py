@@ -1,4 +1,4 @@
-"""A trajectory without gaps from poses of some frames, and orientations of others."""
+"""Interpolation of a gapless trajectory from poses of some frames and orientations of others."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ def bridged(
     T_cw: Sequence[Float64[Tensor, "4 4"] | None],
     R_cw: Sequence[Float64[Tensor, "3 3"] | None],
 ) -> Trajectory:
-    """The trajectory of frames in order of time.
+    """Return the trajectory of frames in order of time.
 
     Args:
         timestamps: seconds.
-        T_cw: pose of each frame, world to camera; none where it is not known.
-        R_cw: orientation of each frame where no more than that is known, else none.
+        T_cw: pose of each frame, world to camera; None where unknown.
+        R_cw: orientation of each frame where only that is known, else None.
 
-    Where only the orientation is known, the camera's centre is put on a line between those around,
-    and stays beyond the first and the last. Where nothing is, the motion is taken to be constant.
+    Where only the orientation is known, the camera's centre is interpolated linearly, and constant
+    beyond the ends. Where nothing is known, constant motion is assumed.
     """
     poses = list(T_cw)
     if any(R is not None for R in R_cw):
@@ -42,7 +42,7 @@ def bridged(
 def camera_centres(
     timestamps: Float[np.ndarray, "n"], T_cw: Sequence[Tensor | None]
 ) -> Float[Tensor, "n 3"]:
-    """Centres of cameras that have a pose; on a line between them, and constant beyond the ends."""
+    """Interpolate camera centres linearly between known poses, constant beyond the ends."""
     at = [n for n, T in enumerate(T_cw) if T is not None]
     if not at:
         return torch.zeros(len(T_cw), 3, dtype=torch.float64)
@@ -54,7 +54,7 @@ def camera_centres(
 def interpolate(
     timestamps: Float[np.ndarray, "n"], T_cw: Sequence[Tensor | None]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Camera to world of every frame; gaps are bridged by constant motion, ends are constant."""
+    """Return camera to world of every frame; gaps by constant motion, ends constant."""
     known = {n: T for n, T in enumerate(T_cw) if T is not None}
     out = np.tile(np.eye(4), (len(T_cw), 1, 1))
     if not known:

@@ -1,4 +1,4 @@
-"""Pose of every frame on the present keyframes, from the sparse flow kept along the way."""
+"""Pose of every frame relative to the present keyframes, from its stored sparse flow."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ from geogs.world.keyframes import KeyframeSet
 ITERATIONS = 8
 """Steps of the motion-only adjustment of a frame."""
 HUBER = 3.0
-"""Deviations beyond which a match of a frame counts linearly."""
+"""Huber threshold of a frame's matches, in deviations."""
 
 
 def solve_trajectory(
@@ -34,11 +34,11 @@ def solve_trajectory(
     elsewhere: Sequence[FrameRecord] = (),
     has_map: bool = True,
 ) -> Trajectory:
-    """Poses of all frames seen so far on the present keyframes, real timestamps.
+    """Solve the poses of all frames so far on the present keyframes, real timestamps.
 
-    Of untracked frames, and those ``elsewhere`` on keyframes of other segments, the position is
-    interpolated between their neighbours, and the orientation is what relative rotations say, else
-    interpolated, too. Without a map (``has_map``) nothing but rotations is known of any.
+    Positions of untracked frames, and of those ``elsewhere`` on keyframes of other segments, are
+    interpolated between their neighbours; their orientations come from relative rotations, or are
+    interpolated, too. Without a map (``has_map``) only rotations are known.
     """
     records = sorted([*frames.records, *elsewhere], key=lambda r: r.index)
     solved = solved_poses(frames, keyframes) if has_map else {}
@@ -54,7 +54,7 @@ def solve_trajectory(
 
 
 def solved_poses(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, Float[Tensor, "4 4"]]:
-    """World to camera of the frames that have a place, by their indices."""
+    """Solve world to camera of the located frames, by their indices."""
     tracked = tracked_on(frames, keyframes)
     solved = {r.index: pose_of(r, keyframes) for r in tracked}
     solver = motion_solver(keyframes.grid, sparse_cells(keyframes.grid))
@@ -67,8 +67,8 @@ def solved_poses(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, Float[Te
 def row_errors(
     frames: FrameLog, keyframes: KeyframeSet, longest_interval: float = LONGEST_INTERVAL
 ) -> RowErrors | None:
-    """Errors of rectified rows at the present state; none where no rows are rectified, nor of
-    frames that are farther apart than ``longest_interval`` seconds."""
+    """Return the errors of rectified rows at the present state; None where no rows are rectified.
+    Frames farther apart than ``longest_interval`` seconds have none."""
     if not frames.rows:
         return None
     indices = sorted(record.index for record in frames.records)
@@ -80,9 +80,9 @@ def row_errors(
 def rows_in_doubt(
     frames: FrameLog, keyframes: KeyframeSet, known: RowErrors | None = None
 ) -> RowErrors | None:
-    """The same (``known`` where they were solved already) where the readout has an error, or is not
-    known at all, so that rows were not rectified; none where it was given. However far frames are
-    apart: poses say how much an error of the readout does, if not what rows have seen."""
+    """Return the row errors (``known`` if already solved) where the readout is estimated, or
+    unknown so that rows were not rectified; None where it was given. Frames may be any interval
+    apart: poses then still give the effect of a readout error, if not the rows' true motion."""
     if frames.open_rows is None:
         if not any(rows.doubt for rows in frames.rows.values()):
             return None
@@ -96,7 +96,7 @@ def rows_in_doubt(
 
 
 def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> None:
-    """Correct what was found of frames by the errors of their rows and their keyframes'."""
+    """Store the correction of the frames' matches for the row errors of both images."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     for part, ids in seen_by_keyframes(frames, keyframes):
@@ -115,8 +115,7 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
 def seen_by_keyframes(
     frames: FrameLog, keyframes: KeyframeSet
 ) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int]]]:
-    """What was found in keyframes of frames that have a place on them, and the ids of these; some
-    at a time."""
+    """Yield the observations of located frames from keyframes, and the ids of these, in parts."""
     tracked = tracked_on(frames, keyframes)
     seen = [(r, o) for r in tracked for o in r.observations if o.keyframe in keyframes]
     for part in in_parts(seen, keyframes.grid.on_gpu):
@@ -124,14 +123,14 @@ def seen_by_keyframes(
 
 
 def tracked_on(frames: FrameLog, keyframes: KeyframeSet) -> list[FrameRecord]:
-    """The frames that have a pose relative to one of the keyframes, these among them."""
+    """Return the frames that have a pose relative to one of the keyframes, including these."""
     return [r for r in frames.records if r.anchor is not None and r.anchor in keyframes]
 
 
 def observed(
     tracked: Sequence[FrameRecord], keyframes: KeyframeSet
 ) -> Iterator[tuple[list[FrameRecord], MotionProblem]]:
-    """The frames between keyframes that these see, some at a time, at the poses they were left at.
+    """Yield the frames between keyframes that have matches, in parts, at their last poses.
 
     Matches are those of :func:`~geogs.tracking.frames.frame_recorder.sparse_cells`.
     """
@@ -145,7 +144,7 @@ def observed(
 
 
 def _problem(records: Sequence[FrameRecord], keyframes: KeyframeSet) -> MotionProblem:
-    """Frames and all their observations, weighted by the depths of their cells, too."""
+    """Return frames and all their observations, with the depth variance of cells in the weights."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     pairs = [
@@ -169,7 +168,7 @@ def depth_aware_weight(
     depth_jacobian: Float[Tensor, "e p 2"],
     information: Float[Tensor, "e p"],
 ) -> Float[Tensor, "e p 2"]:
-    """Inverse variance of a match plus that of the keyframe's depth propagated into the image."""
+    """Return the inverse of a match's variance plus that of its depth propagated into the image."""
     depth = depth_jacobian.square() / information.clamp(min=1e-12)[..., None]
     variance = 1 / weight.clamp(min=1e-12) + depth
     return (weight > 0) * (information > 0)[..., None] / variance

@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 ROUNDS = 3
-"""Gauss-Newton steps that spread what rotations contradict each other by."""
+"""Gauss-Newton steps of the averaging."""
 
 
 def orientations(
     relative: Mapping[int, Sequence[RelativeRotation]],
     known: Mapping[int, Float64[Tensor, "3 3"]],
 ) -> dict[int, Float64[Tensor, "3 3"]]:
-    """World to camera of all frames that relative rotations link to the known ones, without these.
+    """Estimate world to camera of all frames linked to the known ones by relative rotations.
 
-    Where several ways lead to a frame, what they contradict each other by is spread over them by
-    least squares, each weighted by its deviation. If nothing is known, the earliest frame of the
-    largest group that is linked is the world.
+    Contradictions between several paths to a frame are distributed by least squares, weighted by
+    the deviations. If nothing is known, the earliest frame of the largest linked group is the
+    world. Known frames are left out.
 
     Args:
         relative: rotations relative to earlier frames, by the index of each frame.
-        known: rotations of frames that stay as they are, by index.
+        known: rotations of fixed frames, by index.
     """
     links = [(t.frame, n, t.R, t.deviation) for n, several in relative.items() for t in several]
     neighbours: dict[int, list[tuple[int, Tensor]]] = defaultdict(list)
@@ -52,7 +52,7 @@ def orientations(
 
 
 def _earliest_of_largest(neighbours: Mapping[int, list[tuple[int, Tensor]]]) -> dict[int, Tensor]:
-    """The identity for the earliest frame of the largest group; nothing without links."""
+    """Return the identity for the earliest frame of the largest group; empty without links."""
     best: list[int] = []
     left = set(neighbours)
     while left:
@@ -65,7 +65,7 @@ def _earliest_of_largest(neighbours: Mapping[int, list[tuple[int, Tensor]]]) -> 
 def _followed(
     neighbours: Mapping[int, list[tuple[int, Tensor]]], start: Mapping[int, Tensor]
 ) -> dict[int, Tensor]:
-    """The rotations of the start and of all frames linked to them, by the fewest links."""
+    """Return the rotations of the start and of all frames linked to it, by the fewest links."""
     found, queue = dict(start), deque(start)
     while queue:
         a = queue.popleft()
@@ -79,7 +79,7 @@ def _followed(
 def _linearised(
     free: list[int], links: list[tuple[int, int, Tensor, float]], found: dict[int, Tensor]
 ) -> tuple["csc_matrix", Float64[np.ndarray, "n"]]:
-    """Jacobian of the links by the steps of the free rotations, moved from the left, and errors.
+    """Return the Jacobian of the links by left steps of the free rotations, and the errors.
 
     With ``R_b R_a^T`` for the rotation R of b relative to a, the error is
     ``log(R (R_b R_a^T)^T)``; to first order it falls by ``phi_b - (R_b R_a^T) phi_a``.

@@ -1,9 +1,9 @@
 """Errors of rectified rows, once the trajectory and the depths are known.
 
-Rows are rectified before anything is matched, by the motion that the flow between neighbouring
-images tells. The trajectory of all frames tells it better: a point of a frame is seen at the time
-of its row, and where it is then, the poses of the frames around say. What was assumed differs from
-that by fractions of a pixel, so the matches are corrected to first order and the images stay.
+Rows are rectified before matching, by the motion estimated from flow between neighbouring images.
+The trajectory of all frames is more accurate: a point is seen at the time of its row, and the poses
+of the frames around give its position then. The rectification differs from that by fractions of a
+pixel, so the matches are corrected to first order and the images are not changed.
 """
 
 import copy
@@ -25,21 +25,21 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
 NODES = 5
-"""Frames whose poses say where a point is at the time of its row."""
+"""Frames whose poses are interpolated at the time of a row."""
 LONGEST_INTERVAL = 0.3
-"""Seconds between two frames; over more, their poses say nothing of the rows. At a fifth of a
-second they say little, but with what matches add (``row_twists``) the error is a third to two
+"""Longest interval between frames, seconds, at which their poses are used for rows. At a fifth of a
+second they help little, but with the matches (``row_twists``) the error falls to a third to two
 thirds (docs/notebook/shutter.md)."""
 TOGETHER = 64, 512
-"""Edges, or frames, that are looked at together, on the CPU and on a GPU; bounds memory."""
+"""Edges, or frames, processed together, on the CPU and on a GPU; bounds memory."""
 MAX_SHIFT = 0.01
-"""Fraction of the long edge; an error that seems larger is none of the rows."""
+"""Largest row error, as a fraction of the long edge; larger shifts have other causes."""
 
 T = TypeVar("T")
 
 
 class RowShifts(NamedTuple):
-    """Pixels by which something is to be moved, and what a longer readout adds to that."""
+    """Shifts in pixels, and their derivatives by the readout."""
 
     shift: Float[Tensor, "e p 2"]
     slope: Float[Tensor, "e p 2"]
@@ -48,13 +48,13 @@ class RowShifts(NamedTuple):
 
 @dataclass(frozen=True)
 class _RectifiedFrame:
-    """The rows of a frame, and how the camera moved around it."""
+    """Rows of a frame, and the camera's motion around it."""
 
     rows: SeenRows
     nodes: tuple[int, ...]
-    """Frames around it, this among them."""
+    """Frames around it, including itself."""
     times: Float[Tensor, "5"]
-    """Seconds of the nodes, from the frame."""
+    """Times of the nodes relative to the frame, seconds."""
     motions: Float[Tensor, "5 4 4"]
     """Motions from the camera at the frame to the camera at its nodes."""
 
@@ -70,10 +70,10 @@ class RowErrors:
         trajectory: Trajectory,
         longest_interval: float = LONGEST_INTERVAL,
     ) -> None:
-        """``rows`` by frame; ``frames`` are those of the trajectory, in its order, at most
-        ``longest_interval`` seconds apart.
+        """``rows`` by frame; ``frames`` are those of the trajectory, in its order.
 
-        Frames without rows have no errors, nor have those with too few tracked neighbours.
+        Frames without rows have no errors, nor have those with too few tracked neighbours at most
+        ``longest_interval`` seconds apart.
         """
         self._grid = grid
         nodes = _nodes(trajectory, longest_interval)
@@ -91,7 +91,7 @@ class RowErrors:
                 )
 
     def merged(self, other: "RowErrors") -> "RowErrors":
-        """Errors of the frames of both, of one camera and one unit; their numbers differ."""
+        """Return the errors of the frames of both, of one camera and unit; their numbers differ."""
         both = copy.copy(self)
         both._T_cw = self._T_cw | other._T_cw
         both._rectified = self._rectified | other._rectified
@@ -103,13 +103,13 @@ class RowErrors:
         return next((f.rows.doubt for f in self._rectified.values()), 0.0)
 
     def with_readout(self, factor: float) -> "RowErrors":
-        """The same, the readout being so many times what the rows were rectified by."""
+        """Return a copy with the readout scaled by ``factor``."""
         other = copy.copy(self)
         other._factor = factor
         return other
 
     def with_twists(self, frames: Sequence[int], twists: Float64[Tensor, "n 6"]) -> "RowErrors":
-        """The same, the camera moving by so much more per second while it reads these frames."""
+        """Return a copy with additional twists, per second, while these frames are read."""
         known, own = self._known(frames)
         other = copy.copy(self)
         if known:
@@ -122,10 +122,10 @@ class RowErrors:
         return other
 
     def with_lenses(self, lenses: Mapping[int, FrameLens]) -> "RowErrors":
-        """The same, the principal points of frames' lenses moving on while rows are read.
+        """Return a copy with principal points of frames that move during readout.
 
-        What lenses have of their own is off the images, but not off the rows: a principal point
-        that moves while an image is read shears it as a turn of the camera does.
+        Images are corrected for per-frame intrinsics, but rows are not: a principal point that
+        moves during readout shears the image as a rotation of the camera does.
         """
         if not lenses:
             return self
@@ -143,8 +143,8 @@ class RowErrors:
         return other
 
     def twists(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
-        """Twists of frames per second, as the poses around tell them: the slope of the polynomial
-        through all. Zero for frames without rows."""
+        """Return twists of frames per second: the slope of the polynomial through the poses around.
+        Zero for frames without rows."""
         twists = torch.zeros(len(frames), 6, dtype=torch.float64)
         known, own = self._known(frames)
         if known:
@@ -152,8 +152,8 @@ class RowErrors:
         return twists
 
     def twist_deviations(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
-        """Deviations of the twists of frames, as the poses around tell them: how far the slope of
-        the polynomial through all of them is from that through the nearest three, in either half.
+        """Return deviations of these twists: the difference of the slopes of the polynomials
+        through all poses around and through the nearest three, in translation and rotation.
 
         Zero for frames without rows. Source: embedded formulas of numerical differentiation.
         """
@@ -172,7 +172,7 @@ class RowErrors:
     def seconds(
         self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e p"]:
-        """Times of pixels of frames, from the middle row; zero for frames without rows."""
+        """Return times of pixels of frames, from the middle row; zero for frames without rows."""
         found = torch.zeros_like(pixels[..., 0])
         known, own = self._known(frames)
         if known:
@@ -183,12 +183,12 @@ class RowErrors:
         return found
 
     def _known(self, frames: Sequence[int]) -> tuple[list[int], list[_RectifiedFrame]]:
-        """Positions of the frames with rows among some, and what is known of each."""
+        """Return the positions of the frames with rows in the list, and their rows and motion."""
         known = [n for n, frame in enumerate(frames) if frame in self._rectified]
         return known, [self._rectified[frames[n]] for n in known]
 
     def poses(self, frames: Sequence[int]) -> Float[Tensor, "n 4 4"]:
-        """World to camera of frames in the trajectory, float64."""
+        """Return world to camera of frames in the trajectory, float64."""
         return torch.stack([self._T_cw[frame] for frame in frames])
 
     def of_matches(
@@ -200,19 +200,18 @@ class RowErrors:
         inverse_depth: Float[Tensor, "e p"],
         pixels: Float[Tensor, "e p 2"],
     ) -> RowShifts:
-        """Shifts of matches to where they would be if the rows of both frames were right.
+        """Return shifts of matches that correct the rows of both frames.
 
-        What a cell of the source shows lies next to it, and what was found in the target, too; the
-        former is propagated to the target at the cell's own depth. Zero where the sum cannot be
-        right.
+        The point seen by a source cell is shifted, and so is its match in the target; the former
+        shift is propagated to the target at the cell's depth. Zero where the sum is implausible.
 
         Args:
-            source: frame that each edge begins in.
-            target: and that it ends in.
+            source: source frame of each edge.
+            target: target frame of each edge.
             T_ji: from the camera of the source to that of the target.
             rays: of the cells of the source.
             inverse_depth: of the cells.
-            pixels: where they were found in the target.
+            pixels: their matches in the target.
         """
         camera = self._grid.camera
         own = pixels.new_tensor([camera.fx, camera.fy]) * camera.bent(rays[:, :2])
@@ -232,14 +231,14 @@ class RowErrors:
         pixels: Float[Tensor, "e p 2"],
         inverse_depth: Float[Tensor, "e p"],
     ) -> RowShifts:
-        """Shifts from pixels of frames to where what they show lies at the middle row's time.
+        """Return shifts of pixels of frames to the true position of their content at the time of
+        the middle row.
 
-        The camera saw it in another position and at another time; by the poses around, the pixel's
-        own point was elsewhere then. The difference is what the pixel shows instead, to first
-        order.
+        The camera saw it at another position and time; by the poses around, the pixel's own point
+        was elsewhere then. To first order, the shift is the difference of the two.
         """
         found = RowShifts(*(pixels.new_zeros(pixels.shape) for _ in range(2)))
-        # Of several edges of a frame, what it has of its own is brought here once.
+        # Data of a frame is transferred once, even for several edges.
         rectified = {f: self._rectified[f] for f in dict.fromkeys(frames) if f in self._rectified}
         if rectified and pixels.is_cuda:
             known = [n for n, frame in enumerate(frames) if frame in rectified]
@@ -261,7 +260,7 @@ class RowErrors:
         inverse_depth: Float[Tensor, "e p"],
         found: RowShifts,
     ) -> None:
-        """:meth:`_shifted` of all edges of rectified frames by compiled loops, into ``found``."""
+        """Do :meth:`_shifted` for all edges of rectified frames, compiled, into ``found``."""
         from geogs.tracking.frames.row_kernels import shift_pixels
 
         camera = np.array(self._grid.camera.numbers, np.float32)
@@ -283,7 +282,7 @@ class RowErrors:
         pixels: Float[Tensor, "e p 2"],
         inverse_depth: Float[Tensor, "e p"],
     ) -> RowShifts:
-        """:meth:`of_pixels` of edges, each in ``which`` of the frames, in plain PyTorch."""
+        """Do :meth:`of_pixels` for edges, each in ``which`` of the frames, in plain PyTorch."""
         camera, at = self._grid.camera, torch.tensor(which, device=pixels.device)
         offset, seconds = seen_rows([f.rows for f in rectified], at, pixels)
         T = torch.stack([f.motions for f in rectified]).to(pixels)[at]
@@ -316,9 +315,9 @@ def row_shifts(
     measured: Mapping[Pair, Edge],
     frame_of: Callable[[int], int] | None = None,
 ) -> RowShifts:
-    """Pixels by which the matches of some edges are to be corrected.
+    """Return the corrections, in pixels, of the matches of some edges.
 
-    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame, if not its own.
+    ``frame_of`` maps a keyframe's id to its frame in ``errors``; default: its frame index.
     """
     frame_of = frame_of or (lambda id: keyframes[id].frame_index)
     pixels, _ = edge_matches(keyframes.grid, [measured[pair] for pair in part])
@@ -335,13 +334,13 @@ def edge_shifts(
     measured: Mapping[Pair, Edge],
     frame_of: Callable[[int], int] | None = None,
 ) -> Iterator[tuple[list[Pair], RowShifts]]:
-    """The same (:func:`row_shifts`) of all edges, some at a time."""
+    """Yield :func:`row_shifts` of all edges, in parts."""
     for part in in_parts(sorted(measured), keyframes.grid.on_gpu):
         yield part, row_shifts(errors, keyframes, part, measured, frame_of)
 
 
 def in_parts(items: list[T], on_gpu: bool) -> Iterator[list[T]]:
-    """Parts of as many items as are looked at together."""
+    """Yield parts of as many items as are processed together."""
     size = TOGETHER[on_gpu]
     for start in range(0, len(items), size):
         yield items[start : start + size]
@@ -350,8 +349,8 @@ def in_parts(items: list[T], on_gpu: bool) -> Iterator[list[T]]:
 def lagrange(
     times: Float[Tensor, "e 5"], at: Float[Tensor, "e p"]
 ) -> tuple[list[Float[Tensor, "e p"]], list[Float[Tensor, "e p"]]]:
-    """Weights of the values at ``times`` in that of the polynomial through them, one after the
-    other, and how each changes with ``at``."""
+    """Return the Lagrange weights of the values at ``times`` for interpolation at ``at``, and their
+    derivatives by ``at``."""
     off = [at - time[:, None] for time in times.unbind(1)]
     spans = times[:, :, None] - times[:, None]
     scale = (1 / (spans + torch.eye(NODES).to(spans)).prod(-1)).unbind(1)
@@ -367,7 +366,7 @@ def lagrange(
 def slope_at_zero(
     times: Float64[Tensor, "n k"], values: Float64[Tensor, "n k m"]
 ) -> Float64[Tensor, "n m"]:
-    """Derivatives at zero of the polynomials through values at so many times."""
+    """Return derivatives at zero of the polynomials through the values."""
     unit = times.abs().amax(1, keepdim=True)
     return torch.linalg.solve(torch.linalg.vander(times / unit), values)[:, 1] / unit
 
@@ -375,18 +374,18 @@ def slope_at_zero(
 def _nodes_of(
     frames: Sequence[_RectifiedFrame],
 ) -> tuple[Float64[Tensor, "n 5"], Float64[Tensor, "n 5 6"]]:
-    """Seconds of the nodes of frames, and the logarithms of the motions to them."""
+    """Return times of the nodes of frames, and the logarithms of the motions to them."""
     times = torch.stack([f.times for f in frames]).double()
     return times, se3_log(torch.stack([f.motions for f in frames]).double())
 
 
 def _turn_of(lens: FrameLens) -> Float[Tensor, "4 4"]:
-    """The turn of a camera that moves an image as the principal point of its lens does."""
+    """Return the camera rotation that moves an image as its principal point does."""
     return se3_exp(torch.tensor([0.0, 0.0, 0.0, -lens.down, lens.right, 0.0]))
 
 
 def _nodes(trajectory: Trajectory, longest_interval: float) -> list[np.ndarray | None]:
-    """The frames around each whose poses are used; none where too few are known in a row."""
+    """Return the nodes around each frame; None where too few in a row are known."""
     intervals = np.diff(trajectory.timestamps)
     linked = (intervals <= longest_interval) & (intervals > 0)
     linked &= trajectory.tracked[1:] & trajectory.tracked[:-1]
@@ -404,8 +403,8 @@ def _nodes(trajectory: Trajectory, longest_interval: float) -> list[np.ndarray |
 def seen_rows(
     rows: Sequence[SeenRows], which: Int[Tensor, "e"], pixels: Float[Tensor, "e p 2"]
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
-    """Offsets and seconds at pixels, each in ``which`` of the rows, bilinear between the nodes as
-    the image was made."""
+    """Return offsets and seconds at pixels, each in ``which`` of the rows, bilinear between the
+    nodes as in the rectification."""
     field = torch.stack([laid(r) for r in rows]).to(pixels).permute(0, 3, 1, 2)[which]
     size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
     position = 2 * (pixels + CELL + 0.5) / size - 1
@@ -416,5 +415,5 @@ def seen_rows(
 
 
 def laid(rows: SeenRows) -> Float[Tensor, "r c 3"]:
-    """Offsets and seconds of the nodes beside each other."""
+    """Concatenate offsets and seconds of the nodes."""
     return torch.cat([rows.offset, rows.seconds[..., None]], -1)

@@ -1,7 +1,6 @@
 """Compiled loop over pixels of a frame whose rows were rectified; it releases the interpreter lock.
 
-Some two hundred small operations of PyTorch otherwise, of which edges have some thousands of pixels
-each.
+It replaces some two hundred small PyTorch operations; edges have some thousands of pixels each.
 """
 
 import numpy as np
@@ -18,12 +17,12 @@ _TWO, _FOUR = np.float32(2.0), np.float32(4.0)
 def shift_pixels(
     field, times, motions, camera, limits, factor, pixels, plane, inverse_depth, shift, slope
 ):
-    """Fill ``shift`` and ``slope`` (p, 2), as :meth:`RowErrors.of_pixels` says.
+    """Fill ``shift`` and ``slope`` (p, 2), see :meth:`RowErrors.of_pixels`.
 
     Of the frame: ``field`` (r, c, 3) of offsets and seconds, times (5) of the nodes and motions
-    (5, 4, 4) to them. ``camera`` as fx, fy, cx, cy, k1, k2; ``limits`` are the pixels of a cell of
-    the field and the least z. Then the factor on the readout, pixels (p, 2), their points on the
-    plane z = 1 (p, 2) and inverse depths (p); all float32.
+    (5, 4, 4) to them. ``camera``: fx, fy, cx, cy, k1, k2; ``limits``: pixels of a cell of the field
+    and the least z. Then the factor on the readout, pixels (p, 2), their points on the plane z = 1
+    (p, 2) and inverse depths (p); all float32.
     """
     fx, fy, cx, cy, k1, k2 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     cell, nearest = limits[0], limits[1]

@@ -1,4 +1,4 @@
-"""Rows of a rolling shutter in images that were straightened."""
+"""Rolling-shutter rows of straightened images."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from geogs.types import SeenRows
 
 
 def straight_rows(rows: SeenRows, view: StraightView) -> SeenRows:
-    """Where and when the pixels of a straight image were seen, given that of the bent one."""
+    """Convert the rows of a distorted image to those of the straightened one."""
     v, u = torch.meshgrid(*(_nodes(count) for count in rows.seconds.shape), indexing="ij")
     nodes = torch.stack([u, v], -1).reshape(-1, 2)
     bent = view.bent(nodes)
@@ -28,5 +28,5 @@ def straight_rows(rows: SeenRows, view: StraightView) -> SeenRows:
 
 
 def _nodes(count: int) -> Float[Tensor, "n"]:
-    """Pixels of so many nodes along one side."""
+    """Return the pixel positions of the nodes along one side."""
     return (torch.arange(count) - 1) * CELL + (CELL - 1) / 2

@@ -1,9 +1,8 @@
 """Dynamic objects: cells whose matches no depth explains, although the scene's poses are known.
 
-Matches with something that moves agree with each other, not with the scene. Over the pairs of a
-keyframe that were measured, what is left of a cell's matches at the depth that suits them best is
-several times what is left elsewhere. Such regions are *dynamic*: their matches, and those
-that end in them, count nowhere.
+Matches on a moving object agree with each other, not with the scene. Over the measured pairs of a
+keyframe, the residuals of a cell's matches at their best depth are several times those elsewhere.
+Such regions are *dynamic*: their matches, and those that end in them, are not used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,22 +21,22 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
 MIN_RESIDUAL = 0.2
-"""Least usual residual of an edge, in deviations of a match."""
+"""Least median residual of an edge, in deviations of a match."""
 MAX_EDGE_RATIO = 3.0
-"""Largest usual residual of one edge, in multiples of that of all."""
+"""Largest ratio of one edge's median residual to that of all edges."""
 MAX_RATIO = 10.0
-"""Multiples of the usual residual that a single match counts as at most."""
+"""Largest ratio to the median residual that a single match contributes."""
 MAX_STANDING_PARALLAX = 0.25
-"""Fraction of the scene's usual parallax below which a cell stands still in the image, as something
-infinitely far would: what moves with the camera does, too, and stays dynamic."""
+"""Fraction of the scene's median parallax below which a cell stands still in the image, like points
+at infinity: an object that moves with the camera does, too, and stays dynamic."""
 MIN_MATCHES = 0.7
-"""Matches per cell, in the mean around one, from which it can be decided."""
+"""Least mean number of matches per cell around one for a decision."""
 MAX_DYNAMIC = 0.8
-"""Fraction of a keyframe's cells beyond which it is the keyframe that does not suit the others."""
+"""Fraction of a keyframe's cells above which the keyframe itself is inconsistent with others."""
 MIN_DYNAMIC_AROUND = 0.4
-"""Fraction of the cells around one that are dynamic, from which it is dynamic itself."""
+"""Fraction of dynamic cells around a cell above which it is dynamic itself."""
 EDGES_TOGETHER = 128
-"""Directed edges, of some ten keyframes, decided in one go; bounds memory."""
+"""Directed edges, of some ten keyframes, processed at a time; bounds memory."""
 
 
 def static_weight(
@@ -46,7 +45,7 @@ def static_weight(
     pixels: Float[Tensor, "e p 2"],
     weight: Float[Tensor, "e p 2"],
 ) -> Float[Tensor, "e p 2"]:
-    """Weights of matches, none of those from or to a cell that is dynamic."""
+    """Return the weights of matches, zero for those from or to a dynamic cell."""
     some = [
         n for n, (i, j) in enumerate(directed)
         if keyframes[i].moving is not None or keyframes[j].moving is not None
@@ -64,7 +63,7 @@ def propagated(
     pixels: Float[Tensor, "p 2"],
     weight: Float[Tensor, "p 2"],
 ) -> Bool[Tensor, "p"] | None:
-    """Dynamic cells of an image, by the matches of its cells with one whose are known."""
+    """Propagate dynamic cells (``moving``) of another image to an image, by its matches with it."""
     if moving is None:
         return None
     cell, inside = grid.cells_of(pixels)
@@ -72,7 +71,7 @@ def propagated(
 
 
 def dynamic_fraction(keyframes: KeyframeSet) -> float:
-    """Fraction of all cells that is dynamic; 0 without keyframes."""
+    """Return the fraction of dynamic cells; 0 without keyframes."""
     found = [k.moving.float().mean().cpu() for k in keyframes if k.moving is not None]
     return float(torch.stack(found).sum()) / len(keyframes) if found else 0.0
 
@@ -83,12 +82,12 @@ def update_dynamic(
     decided: Sequence[Pair],
     threshold: float,
 ) -> None:
-    """Say anew of the sources of some directed edges which of their cells move.
+    """Update the dynamic cells of the sources of some directed edges.
 
-    ``decided`` are all edges of these sources that have a say; where they say too little of a cell,
-    it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
-    residual around a cell must be. One that was dynamic and keeps its place in the image
-    (``MAX_STANDING_PARALLAX``) stays dynamic.
+    ``decided`` are all edges of these sources that are used; a cell with too few matches keeps its
+    state. ``threshold`` is the least ratio of the mean residual around a cell to the median
+    residual of its edges. A dynamic cell that stands still in the image (``MAX_STANDING_PARALLAX``)
+    stays dynamic.
     """
     directed = sorted(decided)
     if not directed:
@@ -123,11 +122,11 @@ def dynamic_cells(
     before: Bool[Tensor, "n p"],
     threshold: float,
 ) -> Bool[Tensor, "n p"]:
-    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold.
+    """Return regions of keyframes whose mean residual ratio, ``total / count``, is too large.
 
-    A cell that cannot be decided goes with its surroundings, and each with the majority of those
-    around it, so that what moves includes its border. All stay what they were ``before`` where none
-    can be decided or nearly all contradict: then the pose is wrong, or the image is.
+    An undecided cell gets the state of its surroundings, and each the majority of the cells around
+    it, so that a moving region includes its border. All keep their state ``before`` if none can be
+    decided, or nearly all exceed it: then the pose or the image is wrong.
     """
     near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
     known = seen >= MIN_MATCHES
@@ -138,7 +137,7 @@ def dynamic_cells(
 
 
 def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Tensor, "n p"]:
-    """Mean over a square of cells around each, as far as it lies on the grid."""
+    """Return the mean over a square of cells around each, cut at the border of the grid."""
     image = values.view(-1, 1, grid.height, grid.width)
     pooled = avg_pool2d(image, size, 1, size // 2, count_include_pad=False)
     return pooled.view(values.shape)
@@ -147,7 +146,7 @@ def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Te
 def _static(
     keyframes: KeyframeSet, directed: Sequence[Pair], pixels: Float[Tensor, "e p 2"]
 ) -> Bool[Tensor, "e p"]:
-    """Which matches neither leave nor reach a cell that is dynamic."""
+    """Whether matches neither start nor end in a dynamic cell."""
     grid = keyframes.grid
     none = torch.zeros(grid.size, dtype=torch.bool, device=grid.device)
 
@@ -164,10 +163,10 @@ def _static(
 def relative_residuals(
     keyframes: KeyframeSet, edges: Mapping[Pair, Edge], directed: Sequence[Pair]
 ) -> tuple[Float[Tensor, "e p"], Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
-    """Best residuals of some edges as multiples of the usual one of each, and pixels that no
-    rotation explains, neither a number without a match; and what is static.
+    """Return residuals of some edges at the best depths, over the median of each edge; parallax in
+    pixels, i.e. motion beyond rotation (both NaN without a match); and whether matches are static.
 
-    A cell's depth is that which suits these edges best, so they should be all of their sources.
+    A cell's depth is the best fit to these edges, so they should be all edges of their sources.
     """
     grid = keyframes.grid
     ids = sorted({k for e in directed for k in e})
@@ -188,9 +187,9 @@ def relative_residuals(
 
 
 def _usual(residual: Float[Tensor, "e p"], static: Bool[Tensor, "e p"]) -> Float[Tensor, "e"]:
-    """Median residual of each edge over what is static, within what all edges know.
+    """Return the median residual of each edge over static matches, bounded by that of all edges.
 
-    What moves may fill a keyframe, but not most of those that are decided together.
+    A moving object may fill a keyframe, but not most of those processed together.
     """
     usual = torch.where(static, residual, torch.nan).nanmedian(1).values
     common = usual.nanmedian().nan_to_num(MIN_RESIDUAL).clamp(min=MIN_RESIDUAL)

@@ -1,4 +1,4 @@
-"""The frame graph: which keyframes see each other, and the flow measured between them."""
+"""The frame graph: pairs of covisible keyframes, and the flow measured between them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
@@ -31,10 +31,9 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
 HUBER = 0.5
-"""Standard deviations of the flow beyond which a match counts linearly: the flow is more certain
-than it says."""
+"""Huber threshold in standard deviations of the flow, which are overestimated."""
 STACKED_EDGES = 1024, 8192
-"""Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
+"""Most directed edges of an adjustment with all matches in one tensor, on CPU and GPU."""
 
 
 class FrameGraph:
@@ -47,8 +46,8 @@ class FrameGraph:
         odometry: Odometry | None = None,
         edges: dict[Pair, Edge] | None = None,
     ) -> None:
-        """``odometry`` takes part in adjustments, where there is one; ``edges`` are those that are
-        measured already, and are changed in place."""
+        """``odometry``, if any, takes part in adjustments; ``edges`` are those already measured,
+        and are changed in place."""
         self.keyframes = keyframes
         self.odometry = odometry
         self.operator = operator
@@ -56,7 +55,7 @@ class FrameGraph:
         self.bundle = bundle_solver(keyframes.grid)
 
     def see_by(self, camera: Camera) -> None:
-        """Take matches and depths for what another camera saw."""
+        """Assume another camera for matches and depths."""
         self.keyframes.table.see_by(camera)
         self.bundle = bundle_solver(self.keyframes.grid)
 
@@ -67,18 +66,18 @@ class FrameGraph:
 
     @property
     def packed(self) -> dict[Pair, PackedEdge]:
-        """The edges that are kept packed."""
+        """Packed edges."""
         return {pair: e for pair, e in self.edges.items() if isinstance(e, PackedEdge)}
 
     def remove_keyframe(self, id: int) -> None:
-        """Forget every edge of a keyframe."""
+        """Remove every edge of a keyframe."""
         for directed in [e for e in self.edges if id in e]:
             del self.edges[directed]
 
     def retire(self, keep: Collection[int], least: int = 1) -> dict[Pair, Edge]:
-        """Take out the edges that join none of the given keyframes, and return them.
+        """Remove and return the edges that join none of the given keyframes.
 
-        None where they are fewer than ``least``.
+        Nothing is removed if they are fewer than ``least``.
         """
         kept = set(keep)
         old = {e: v for e, v in self.edges.items() if e[0] not in kept and e[1] not in kept}
@@ -89,13 +88,13 @@ class FrameGraph:
         return old
 
     def replace(self, edges: Mapping[Pair, Edge]) -> None:
-        """Have these edges instead of all others."""
+        """Replace all edges."""
         edges = dict(edges)
         self.edges.clear()
         self.edges.update(edges)
 
     def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
-        """Present positions of the cells of i in j for each directed edge (i, j)."""
+        """Return present positions of the cells of i in j for each directed edge (i, j)."""
         return keyframe_pairs(self.keyframes, directed).project()
 
     def measure(self, pairs: Iterable[Pair], fine: bool = True, packed: bool = False) -> None:
@@ -122,7 +121,7 @@ class FrameGraph:
             self.edges[j, i] = _edge_of(back, n, backward[n])
 
     def _keep_packed(self, directed: Sequence[Pair], match: FlowMatch) -> None:
-        """Keep a measurement that started from the present state."""
+        """Store a measurement that started from the present state."""
         position, half_weight = pack_matches(self.keyframes.grid, match.pixels, match.weight)
         for n, (i, j) in enumerate(directed):
             source, target = self.keyframes[i], self.keyframes[j]
@@ -137,15 +136,15 @@ class FrameGraph:
         return None if edge is None else edge.memory
 
     def release(self, moving: Collection[int]) -> None:
-        """Let go of what the operator keeps of edges that do not join a moving keyframe."""
+        """Free the flow operator's cache of edges that do not join a moving keyframe."""
         for directed, edge in self.edges.items():
             if directed[0] not in moving and directed[1] not in moving:
                 edge.memory = None
 
     def stale(self, pairs: Sequence[Pair], tolerance: float) -> list[Pair]:
-        """Pairs that are new or whose reprojection has moved more than ``tolerance`` pixels.
+        """Return pairs that are new or whose reprojection has moved by more than ``tolerance``.
 
-        The median over the matched cells of the direction that moved more counts.
+        It is in pixels: the median over the matched cells, of the direction that moved more.
         """
         known = [p for p in pairs if p in self.edges]
         new = [p for p in pairs if p not in self.edges]
@@ -156,8 +155,8 @@ class FrameGraph:
         return new + [p for p, m in zip(known, worst.tolist(), strict=True) if m > tolerance]
 
     def _moved(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
-        """Median motion in pixels of the matched cells since they were measured; some edges at a
-        time, concurrently on the CPU."""
+        """Return the median motion in pixels of the matched cells since they were measured; in
+        parts, concurrently on the CPU."""
         grid = self.keyframes.grid
 
         def moved(part: Sequence[Pair]) -> Float[Tensor, "k"]:
@@ -172,14 +171,14 @@ class FrameGraph:
     def problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
     ) -> tuple[BundleProblem, list[int]]:
-        """The adjustment of the given edges, and the keyframe id of each of its frames."""
+        """Return the adjustment of the given edges, and the keyframe id of each of its frames."""
         problem, ids = self.streamed_problem(directed, free_pose, free_depth)
         return problem.part(slice(None)), ids
 
     def streamed_problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
     ) -> tuple[StreamedProblem, list[int]]:
-        """The same as :meth:`problem`, with the matches left where they are."""
+        """Return the same as :meth:`problem`, with matches read in parts."""
         directed = sorted(directed)
         poses, depths = set(free_pose), set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
@@ -209,9 +208,9 @@ class FrameGraph:
         return problem, ids
 
     def update_dynamic(self, ids: Collection[int], threshold: float) -> None:
-        """Say anew which cells of some keyframes move, by all their edges (:func:`update_dynamic`).
+        """Update the dynamic cells of some keyframes by all their edges (:func:`update_dynamic`).
 
-        A threshold of 0 says nothing.
+        A threshold of 0 changes nothing.
         """
         if threshold > 0:
             decided = [e for e in self.edges if e[0] in ids]
@@ -227,7 +226,7 @@ class FrameGraph:
     ) -> BundleResult | None:
         """Solve for poses and inverse depths and store them; None (nothing stored) on failure.
 
-        What is very near may be ``bounded`` in its influence (:func:`solve_bounded`).
+        With ``bounded`` the influence of very near cells is limited (:func:`solve_bounded`).
         """
         if not directed:
             return None
@@ -262,7 +261,7 @@ class FrameGraph:
 
 
 def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
-    """Depths of keyframes' cells by depth sensors; none where no keyframe has any."""
+    """Return sensor depths of keyframes' cells; None where no keyframe has any."""
     if all(k.measured is None for k in keyframes):
         return None
     unknown = torch.zeros_like(keyframes[0].inverse_depth)
@@ -277,14 +276,14 @@ def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
 
 
 def _edge_of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> MeasuredEdge:
-    """The n-th edge of a measurement."""
+    """Return the n-th edge of a measurement."""
     damping = None if match.damping is None else match.damping[n]
     memory = None if match.memory is None else match.memory[n]
     return MeasuredEdge(match.pixels[n], match.weight[n], reprojection, damping, memory)
 
 
 def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
-    """Reprojections of the cells when the flow of each edge was measured."""
+    """Return reprojections of the cells when the flow of each edge was measured."""
     packed = [e for e in edges if isinstance(e, PackedEdge)]
     if packed and len(packed) == len(edges):
         return _packed_reprojections(grid, packed)
@@ -295,7 +294,7 @@ def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e 
 
 
 def _packed_reprojections(grid: SampleGrid, edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
-    """The same of packed edges, by the poses and depths of that time."""
+    """Compute them for packed edges, by the poses and depths of that time."""
     source, target = (torch.stack([getattr(e, k) for e in edges]) for k in ("T_source", "T_target"))
     depth = torch.stack([e.inverse_depth for e in edges])
     return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
@@ -304,7 +303,7 @@ def _packed_reprojections(grid: SampleGrid, edges: Sequence[PackedEdge]) -> Floa
 def _frame_damping(
     edges: Sequence[Edge], source: Sequence[int], frames: int
 ) -> DepthDamping | None:
-    """Damping of each frame: the mean over the edges that leave it; None where there is none."""
+    """Return the mean damping of each frame over its outgoing edges; None where there is none."""
     given = [(e.damping, n) for e, n in zip(edges, source, strict=True) if e.damping is not None]
     if not given:
         return None

@@ -1,9 +1,9 @@
-"""How much a cell may say of a camera's place: something very near is often something that moves.
+"""Bounded influence of near cells on the camera's pose: a very near object often moves.
 
-What a match does to a translation goes with the cell's inverse depth, and its share in the normal
-equations with the square. What moves across a view that hardly changes looks like something very
-near, gains the influence of that, and can turn the motion of the camera until it fits; then nothing
-is left by which it could be told. Once it is told, what is near may count in full.
+The effect of a match on the translation is proportional to the cell's inverse depth, and its weight
+in the normal equations to the square. An object that moves across a nearly static view looks very
+near, gets a large influence, and can pull the camera's motion until it fits; then it can no longer
+be detected. Once dynamic cells are detected, near cells may count in full.
 """
 
 from collections.abc import Callable
@@ -19,18 +19,18 @@ from geogs.bundle.protocols import BundleOptions, BundleResult
 Solve = Callable[[StreamedProblem, BundleOptions], BundleResult]
 
 FARTHER, NEAREST = 0.75, 2.5
-"""Multiple of the inverse depth that so much of a keyframe does not exceed, from which on cells
-have no more influence: three medians in a room, four and a half on a street."""
+"""Quantile of a keyframe's inverse depth, and the multiple of it above which influence grows no
+more: three medians in a room, four and a half on a street."""
 LEAST = 0.01
-"""Of a weight that is always left: before a far background all that tells a translation is near."""
+"""Least factor on a weight: before a far background only near cells determine the translation."""
 
 
 def bounded_influence(inverse_depth: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-    """Factors on the weights of matches, by the inverse depths of their cells.
+    """Return factors on the weights of matches, by the inverse depths of their cells.
 
-    One up to ``NEAREST`` times what is usual; beyond, such that the influence on a translation
-    stays what it is there (a Mallows estimator: the bound depends on where a measurement was taken,
-    not on how it fits). ``LEAST`` at least.
+    One up to ``NEAREST`` times the usual inverse depth; beyond, the influence on a translation is
+    constant (a Mallows estimator: the bound depends on where a measurement was taken, not on how
+    it fits). ``LEAST`` at least.
     """
     rank = 1 + int(FARTHER * (inverse_depth.shape[1] - 1))
     usual = inverse_depth.kthvalue(rank, 1, keepdim=True).values
@@ -38,8 +38,8 @@ def bounded_influence(inverse_depth: Float[Tensor, "n p"]) -> Float[Tensor, "n p
 
 
 def solve_bounded(problem: StreamedProblem, solve: Solve, options: BundleOptions) -> BundleResult:
-    """Solve with the influence of what is near bounded, then for the depths alone without a bound:
-    what a cell may say of poses is one thing, what its matches say of its own depth another."""
+    """Solve with bounded influence of near cells, then for the depths alone without a bound: only
+    the influence on poses has to be limited, not that on a cell's own depth."""
     influence = bounded_influence(problem.inverse_depth)
     if bool((influence == 1).all()):
         return solve(problem, options)

@@ -1,7 +1,7 @@
-"""Poses of another tracker in ours: whether they fit, at which scale, and what they say of motion.
+"""Odometry poses from another tracker: agreement with the images, scale, and motion terms.
 
-Only motions between neighbouring keyframes are used, so that a world of its own and a drift do no
-harm. Until enough of them fit those of the images they are not used at all.
+Only motions between neighbouring keyframes are used, so that its own world frame and drift do no
+harm. They are not used at all until enough of them fit those of the images.
 """
 
 from collections.abc import Sequence
@@ -20,28 +20,28 @@ from geogs.world.keyframes import Keyframe, KeyframeSet
 from geogs.world.segments import OdometryScale
 
 MIN_AGREEMENT = 0.4
-"""Fraction of the motions that must fit those of the images before any of them is used: of another
-recording hardly any does."""
+"""Fraction of the motions that must fit those of the images before any is used: those of another
+recording hardly ever fit."""
 MIN_MOTIONS = 5
 """Motions that must fit before any is used."""
 MAX_DEVIATION = 0.1
-"""Relative deviation of the scale up to which motions are used ..."""
+"""Largest relative deviation of the scale at which motions are used."""
 PRECISE = 0.003
-"""... and up to which it is asked again with every keyframe."""
+"""Relative deviation of the scale above which it is estimated again with every keyframe."""
 LATEST = 200
-"""Latest motions that are asked while the camera is tracked."""
+"""Latest keyframes whose motions are used for the scale while the camera is tracked."""
 
 
 @dataclass(frozen=True)
 class OdometryAgreement:
-    """How far measured motions fit those of the images."""
+    """Agreement of odometry with the images."""
 
     motions: int
-    """Number of motions that were measured between neighbouring keyframes."""
+    """Number of odometry motions between neighbouring keyframes."""
     fitting: float
     """Fraction of these that fit within their deviations."""
     used: bool
-    """Whether they took part."""
+    """Whether they were used."""
 
 
 class Odometry:
@@ -50,13 +50,13 @@ class Odometry:
     def __init__(
         self, keyframes: KeyframeSet, config: OdometryConfig, found: OdometryScale | None = None
     ) -> None:
-        """``found`` is what is known of the scale already, and is changed in place."""
+        """``found`` is the scale so far, changed in place."""
         self.keyframes = keyframes
         self.config = config
         self.found = found or OdometryScale()
 
     def update_scale(self) -> None:
-        """Find the scale, if it is not precise yet, by the latest keyframes."""
+        """Estimate the scale from the latest keyframes, if it is not precise yet."""
         ids = self.keyframes.ids[-LATEST:]
         if not ids or self.keyframes[ids[-1]].pose is None:
             return
@@ -64,18 +64,18 @@ class Odometry:
             self._take(self._vote(ids))
 
     def update_scale_by_all(self) -> None:
-        """Find the scale by all keyframes."""
+        """Estimate the scale from all keyframes."""
         self._take(self._vote(self.keyframes.ids))
 
     def agreement(self) -> OdometryAgreement:
-        """How far all motions fit, at the present poses."""
+        """Return the agreement of all motions, at the present poses."""
         vote = self._vote(self.keyframes.ids)
         return OdometryAgreement(len(vote.fits), vote.fraction, self.found.scale is not None)
 
     def between(self, ids: Sequence[int]) -> MeasuredMotions | None:
-        """Motions from each of some keyframes to the next, in the unit of the map.
+        """Return the motions from each of some keyframes to the next, in the unit of the map.
 
-        Sources and targets are indices among the ids. None where they are not to be used.
+        Sources and targets are indices among the ids. None where motions are not used.
         """
         scale = self.found.scale
         if scale is None:
@@ -90,7 +90,7 @@ class Odometry:
         return MeasuredMotions(source, target, motion, information)
 
     def since(self, keyframe: Keyframe, pose: MeasuredPose | None) -> torch.Tensor | None:
-        """Motion from a keyframe to where the camera is said to be, in the unit of the map."""
+        """Return the odometry motion from a keyframe to a pose, in the unit of the map."""
         before, scale = keyframe.pose, self.found.scale
         if scale is None or pose is None or before is None or before.world != pose.world:
             return None
@@ -101,8 +101,8 @@ class Odometry:
     def _measured(
         self, ids: Sequence[int]
     ) -> tuple[list[tuple[int, int]], Float[torch.Tensor, "m 4 4"]]:
-        """Neighbours whose poses are of one world, by their places among some keyframes, and the
-        motions from each to the next, metres."""
+        """Return neighbours with poses in one world, as index pairs among ``ids``, and the motions
+        from each to the next, metres."""
         known = [(n, self.keyframes[k].pose) for n, k in enumerate(ids)]
         poses = [(n, pose) for n, pose in known if pose is not None]
         steps = [(a, b) for a, b in pairwise(poses) if a[1].world == b[1].world]

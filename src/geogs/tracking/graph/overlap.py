@@ -1,4 +1,4 @@
-"""Which keyframes cannot be matched with each other, found without looking at single cells."""
+"""Fast rejection of keyframe pairs that cannot be matched, without testing single cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from geogs.world.keyframes import KeyframeSet
 TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""
 LARGEST_ZOOM = 2.5
-"""Ratio of the sizes in which two keyframes may show what either looks at: matching compares
-windows of one size. Two that look towards each other from rooms away, through all walls between,
-would pass by motion alone, as either sees what the other looks at far ahead, where little moves."""
+"""Largest ratio of the image scales at which two keyframes show the same point: matching compares
+windows of one size. Two keyframes that face each other from rooms away, through all walls between,
+would pass by motion alone, as each sees the other's view far ahead, where little moves."""
 STEP = 2
-"""Every such row and column of cells is looked at, as for distances between keyframes."""
+"""Interval of the rows and columns of cells that are used, as for distances of keyframes."""
 TARGETS_TOGETHER = 32
 """Keyframes against which all others are tested at a time; bounds memory."""
 
 
 @dataclass(frozen=True)
 class _Spheres:
-    """Around the points that each tile of each keyframe sees, in world coordinates."""
+    """Bounding spheres of the points seen by each tile of each keyframe, in world coordinates."""
 
     centre: Float[Tensor, "n t 3"]
     radius: Float[Tensor, "n t"]
@@ -34,19 +34,19 @@ class _Spheres:
     """Fraction of the cells in each tile."""
 
     def around(self) -> "_Spheres":
-        """One sphere around all of each keyframe."""
+        """Return one sphere around all points of each keyframe."""
         centre = self.centre.mean(1, keepdim=True)
         reach = (self.centre - centre).norm(dim=-1) + self.radius
         return _Spheres(centre, 1.001 * reach.amax(1, keepdim=True), torch.ones(1))
 
     def of(self, rows: Int[Tensor, "m"]) -> "_Spheres":
-        """The spheres of some of the keyframes."""
+        """Return the spheres of some of the keyframes."""
         return _Spheres(self.centre[rows], self.radius[rows], self.fraction)
 
     def reach(
         self, normal: Float[Tensor, "m k 3"], offset: Float[Tensor, "m k"]
     ) -> Bool[Tensor, "n m t"]:
-        """Whether each reaches into what the planes of each view bound."""
+        """Whether each sphere reaches into the frustum of each view."""
         distance = torch.einsum("ntd,mkd->nmtk", self.centre, normal) + offset[:, None]
         return (distance >= -self.radius[:, None, :, None]).all(-1)
 
@@ -54,10 +54,10 @@ class _Spheres:
 def may_overlap(
     store: KeyframeSet, source: Sequence[int], target: Sequence[int], least: float
 ) -> Bool[np.ndarray, "n m"]:
-    """False where no more than ``least`` of the cells of a source falls into a target.
+    """Return False where at most a fraction ``least`` of a source's cells falls into a target.
 
-    Every tile whose bounding sphere reaches into the target's view is counted as if all its cells
-    did, so True proves nothing and False is certain.
+    A tile whose bounding sphere reaches into the target's view counts with all its cells, so False
+    is certain, but True is not.
     """
     spheres = _spheres(store, source)
     whole = spheres.around()
@@ -65,7 +65,7 @@ def may_overlap(
     for begin in range(0, len(target), TARGETS_TOGETHER):
         part = target[begin : begin + TARGETS_TOGETHER]
         planes = _view_planes(store.grid.camera, store.poses(part))
-        # Of a long walk most keyframes are nowhere near these few.
+        # On a long walk most keyframes are nowhere near these few.
         near = torch.nonzero(whole.reach(*planes)[..., 0].any(1))[:, 0]
         fraction = spheres.of(near).reach(*planes).float() @ spheres.fraction
         out[near.numpy(), begin : begin + len(part)] = (fraction > least - 1e-6).numpy()
@@ -75,9 +75,9 @@ def may_overlap(
 def alike_in_size(
     store: KeyframeSet, first: Sequence[int], second: Sequence[int]
 ) -> Bool[np.ndarray, "n m"]:
-    """Whether two keyframes show what either looks at in sizes of a ratio up to ``LARGEST_ZOOM``.
+    """Whether the image scales of two keyframes differ by a ratio up to ``LARGEST_ZOOM``.
 
-    What a keyframe looks at is the point on its optical axis at the median depth.
+    They are compared at the point on the optical axis of each, at its median depth.
     """
     ids = sorted({*first, *second})
     row = {id: n for n, id in enumerate(ids)}
@@ -124,7 +124,7 @@ def _spheres(store: KeyframeSet, ids: Sequence[int]) -> _Spheres:
 def _view_planes(
     camera: Camera, T_cw: Float[Tensor, "m 4 4"]
 ) -> tuple[Float[Tensor, "m 5 3"], Float[Tensor, "m 5"]]:
-    """Inward normals n and offsets o of the planes around each view: n . x + o >= 0 within."""
+    """Return inward normals n and offsets o of each view's frustum: n . x + o >= 0 within."""
     c = camera
     planes = torch.tensor(
         [

@@ -1,4 +1,4 @@
-"""Distances between keyframes by what they see, and which pairs of them are worth an edge."""
+"""Image-based distances between keyframes, and selection of pairs for edges."""
 
 from collections.abc import Iterable, Sequence
 
@@ -14,7 +14,7 @@ from geogs.world.edges import Pair
 from geogs.world.keyframes import KeyframeSet
 
 RADIUS = 3
-"""Every keyframe is matched with this many before it, as in DROID-SLAM."""
+"""Number of preceding keyframes that each is matched with, as in DROID-SLAM."""
 PAIRS_TOGETHER = 512, 8192
 """Directed pairs that are projected at a time, on the CPU and on a GPU; bounds memory."""
 
@@ -22,7 +22,7 @@ PAIRS_TOGETHER = 512, 8192
 def frame_distances(
     store: KeyframeSet, directed: Sequence[Pair], rotation_weight: float = 0.3
 ) -> Float[Tensor, "e"]:
-    """Distance of directed keyframe pairs in pixels; infinite at little overlap."""
+    """Return the distance of directed keyframe pairs in pixels; infinite at little overlap."""
     if not directed:
         return store.grid.pixels.new_zeros(0)
     return keyframe_pairs(store, directed).distances(rotation_weight)
@@ -38,12 +38,11 @@ def proximity_pairs(
     max_distance: float,
     max_pairs: int,
 ) -> list[Pair]:
-    """Pairs to add between ``later`` and ``earlier`` keyframes (DROID-SLAM's proximity factors).
+    """Select pairs between ``later`` and ``earlier`` keyframes (DROID-SLAM's proximity factors).
 
-    Every later keyframe is paired with its ``radius`` predecessors; then pairs that show things
-    alike in size are taken by growing distance up to ``max_distance`` pixels, each suppressing
-    those within ``suppression`` keyframes of it, as the existing pairs do, until ``max_pairs`` are
-    found.
+    Every later keyframe is paired with its ``radius`` predecessors. Then pairs of similar image
+    scale are taken by growing distance up to ``max_distance`` pixels, each suppressing those within
+    ``suppression`` keyframes of it, as the existing pairs do, until there are ``max_pairs``.
     """
     ids = store.ids
     position = {k: n for n, k in enumerate(ids)}
@@ -82,7 +81,7 @@ def _by_distance(
     wanted: Bool[np.ndarray, "r c"],
     max_distance: float,
 ) -> list[Pair]:
-    """Wanted pairs of positions that are near enough, by growing distance."""
+    """Return the wanted pairs of positions that are near enough, by growing distance."""
     ids = store.ids
     first, second = ([ids[k] for k in part.tolist()] for part in (rows, columns))
     if wanted.any():
@@ -111,7 +110,7 @@ def _by_distance(
 
 
 class _Suppression:
-    """Which pairs of positions lie too near to one that is there already."""
+    """Suppression of pairs of positions that are too near to an existing one."""
 
     def __init__(
         self, rows: Int[np.ndarray, "r"], columns: Int[np.ndarray, "c"], reach: int
@@ -134,7 +133,7 @@ class _Suppression:
         return bool(self._blocked[pair[0] - self._corner[0], pair[1] - self._corner[1]])
 
     def block(self, pair: Pair) -> None:
-        """A pair is there: those around it, |da| + |db| no more than the reach, are not wanted."""
+        """Block the pairs around an existing one: those with |da| + |db| up to the reach."""
         limit = max(min(abs(pair[0] - pair[1]) - 2, self._reach), 0)
         for da in range(-limit, limit + 1):
             a = pair[0] + da - self._corner[0]

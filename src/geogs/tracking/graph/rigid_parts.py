@@ -1,10 +1,10 @@
-"""Parts of a frame graph, each held together by one rigid structure.
+"""Rigidly connected parts of a frame graph.
 
-Matches on what moves place a camera as surely as any others. Where people fill the view for a
-moment, keyframes hang together by the scene before and after, and by the people meanwhile: each
-part is right by itself, but to the others it stands anyhow, in pose and in scale. The keyframe
-between two parts tells: its cells that agree with the one are not those that agree with the other,
-so no structure hands anything on.
+Matches on moving objects locate a camera as confidently as any others. Where people fill the view
+for a moment, keyframes are linked by the scene before and after, and by the people meanwhile: each
+part is correct by itself, but relative to the others its pose and scale are arbitrary. The keyframe
+between two parts shows it: the cells that agree with the one do not agree with the other, so no
+common structure links them.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -19,13 +19,13 @@ from geogs.world.edges import Edge, Pair
 from geogs.world.keyframes import KeyframeSet
 
 MAX_RESIDUAL = 3.0
-"""Multiples of the usual residual up to which a cell agrees with a match."""
+"""Largest ratio to the median residual at which a cell agrees with a match."""
 MIN_SUPPORT = 0.03
-"""Least fraction of a keyframe's cells that agree with an edge for it to hold anything."""
+"""Least fraction of a keyframe's cells that agree with an edge for it to count."""
 MIN_SHARED = 0.4
-"""Least fraction of a keyframe's cells that agree with an edge which agree with another one, too,
-for one structure to hold both; of that edge with which more agree. Of 24 starts that were right the
-least was 0.45; of nine that people in between held together 0.35 the most."""
+"""Least fraction of the cells that agree with one edge of a keyframe and also with another, for a
+rigid connection of the two; of the edge with more such cells. In 24 correct starts the least was
+0.45; in nine that were linked by people the largest was 0.35."""
 
 
 def largest_part(
@@ -34,11 +34,11 @@ def largest_part(
     shared: float = MIN_SHARED,
     fixed: Collection[int] = (),
 ) -> frozenset[int]:
-    """The most keyframes that one structure holds together, of several such parts the earliest.
+    """Return the largest rigidly connected set of keyframes; of several the earliest.
 
-    ``edges`` lead both ways between the keyframes of each pair; two of one keyframe are held by one
-    structure where so large a part of the cells that agree with either is ``shared``, and all of
-    keyframes that are ``fixed``.
+    ``edges`` exist both ways between the keyframes of each pair. Two of one keyframe are connected
+    if they share at least a fraction ``shared`` of their agreeing cells; all edges of ``fixed``
+    keyframes are connected.
     """
     support: dict[Pair, float] = {}
     joints: list[tuple[Pair, Pair]] = []
@@ -66,8 +66,8 @@ def largest_part(
 
 
 def _components(nodes: Sequence[Pair], links: Sequence[tuple[Pair, Pair]]) -> list[int]:
-    """The number of the connected part of each node; links of what is no node join nothing."""
-    from scipy.sparse import coo_array  # no frame before a start has need of it
+    """Return the connected component of each node; links to unknown nodes are ignored."""
+    from scipy.sparse import coo_array  # not needed before a start
     from scipy.sparse.csgraph import connected_components
 
     if not nodes:

@@ -1,4 +1,4 @@
-"""Which frames become keyframes."""
+"""Keyframe selection."""
 
 import itertools
 import math
@@ -15,48 +15,48 @@ from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 MIN_FLOW = 0.2
-"""Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
-hardly moved, so it is the image that is poor."""
+"""Fraction of a keyframe's motion below which a lost overlap is ignored: the camera has hardly
+moved, so the image is poor."""
 WITH_ROTATION = 1.4
-"""Motion that makes a keyframe before depths are known, in multiples of the parallax that does
-later: part of it is the rotation's."""
+"""Motion for a keyframe before depths are known, in multiples of the parallax needed later: a part
+of it is rotation."""
 MAX_FLOW = 0.15
-"""Motion that makes a keyframe without any parallax, of the long edge: over larger ones flow finds
-fewer matches, and worse ones."""
+"""Motion for a keyframe without any parallax, as a fraction of the long edge: for larger motions
+flow finds fewer and worse matches."""
 LATEST, END_FRACTION = 5, 1 / 3
-"""Where fewer frames are left than lie between two of so many latest keyframes, this fraction of
-the usual parallax makes one: what comes into view there is seen by no later keyframe, and one alone
-gives no depth."""
+"""Number of latest keyframes, and fraction of the usual parallax that is enough if fewer frames are
+left than between two of these: what comes into view there is not seen by later keyframes, and a
+single one gives no depth."""
 BLUR_RATIO = 0.7
-"""A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
+"""Ratio to the latest frames' sharpness below which a frame is blurred."""
 BLUR_WAIT = 0.4
-"""... and becomes a keyframe only when it has moved by this much more: a sharper one may come."""
+"""Relative additional motion before a blurred frame becomes a keyframe: a sharper one may come."""
 _COMPARED = 12
-"""Latest frames among which one is sharp or blurred."""
+"""Number of latest frames whose sharpness is compared."""
 _EDGE = 320
-"""Longer side of the image in which sharpness is measured; below it, noise counts for less."""
+"""Longer side, in pixels, of the image for sharpness; reduction lowers the noise."""
 
 
 @dataclass(frozen=True)
 class SeenMotion:
-    """How a frame has moved since the last keyframe."""
+    """Motion of a frame since the last keyframe."""
 
     flow: float
-    """Median motion of the cells that are matched, pixels."""
+    """Median motion of the matched cells, pixels."""
     overlap: float
-    """Fraction of the keyframe's cells that are. In forward motion the cells that move most leave
-    the image or are not matched any more, so that the median motion of the rest stays small while
-    the overlap goes."""
+    """Fraction of the keyframe's cells that are matched. In forward motion the fastest cells leave
+    the image or lose their match, so the median motion of the rest stays small while the overlap
+    falls."""
     match: FlowMatch
     """One edge, keyframe -> frame."""
     parallax: float | None = None
-    """Median of the motion without the rotation's, where it is known, pixels."""
+    """Median motion without that of the rotation, pixels; None where unknown."""
 
 
 def mean_flow(grid: SampleGrid, match: FlowMatch) -> float:
-    """Mean motion in pixels of the cells that are matched in the first edge, 0 without any.
+    """Return the mean motion in pixels of the matched cells of the first edge, 0 without any.
 
-    Source: DROID-SLAM's motion filter, which asks all cells as its network says a motion of each.
+    Source: DROID-SLAM's motion filter, which uses all cells, as its network gives a motion of each.
     """
     used = match.weight[0, :, 0] > 0
     motion = (match.pixels[0] - grid.pixels).norm(dim=-1)
@@ -72,17 +72,17 @@ def calls_for_keyframe(
 ) -> bool:
     """Whether a frame is far enough from the last keyframe to become one.
 
-    A keyframe brings depth by its parallax; one of a camera that has only turned brings none, and
-    is needed where the view goes out of sight. So the parallax decides, or the overlap. Before
-    depths are known, the rotation is not told from the motion, and all of it counts.
+    A keyframe gives depth by its parallax; after a pure rotation it gives none, and is only needed
+    where the view leaves the image. So parallax or overlap decide. Before depths are known,
+    rotation cannot be separated from translation, and all motion counts.
 
     Args:
         config: ``keyframe_parallax`` and ``keyframe_overlap``; or ``keyframe_mean_flow``, which
             decides alone where it is given.
         grid: of the keyframe.
         seen: the motion.
-        patience: it may come so much further.
-        part: of the usual parallax that is enough.
+        patience: relative increase of the thresholds.
+        part: fraction of the usual parallax that is enough.
     """
     more, long_edge = 1 + patience, grid.camera.long_edge
     if config.keyframe_mean_flow > 0:
@@ -96,7 +96,7 @@ def calls_for_keyframe(
 
 
 def is_near_end(left: int | None, latest: Iterable[int]) -> bool:
-    """Whether too few frames are ``left``, as far as that is known, for another keyframe.
+    """Whether too few frames are ``left`` for another keyframe; False if that is unknown.
 
     ``latest`` are the numbers of the frames that became the latest keyframes.
     """
@@ -106,11 +106,10 @@ def is_near_end(left: int | None, latest: Iterable[int]) -> bool:
 
 
 def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Energy of an image's gradients in the direction that has least, over the image's variance.
+    """Return the gradient energy of an image in its weakest direction, over the image's variance.
 
-    Blur by motion takes from the gradients along the motion, hardly from the variance. The number
-    says little by itself, for it follows what is seen; among neighbours in a video it tells
-    which are blurred.
+    Motion blur reduces gradients along the motion, but hardly the variance. The value depends on
+    the content, so only a comparison among neighbours in a video shows which are blurred.
     """
     height, width = image.shape[:2]
     shrink = min(1.0, _EDGE / max(height, width))
@@ -124,34 +123,32 @@ def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
 
 
 class KeyframeChoice:
-    """Says which frames become keyframes, from their parallax, overlap and sharpness."""
+    """Selects keyframes by parallax, overlap and sharpness."""
 
     def __init__(
         self, config: TrackingConfig, grid: SampleGrid, recent: list[float] | None = None
     ) -> None:
-        """``recent`` is the sharpness of the latest frames, and is changed in place."""
+        """``recent``: sharpness of the latest frames, changed in place."""
         self.config = config
         self.grid = grid
         self._recent = [] if recent is None else recent
         self._concurrent = BackgroundTask("sharpness")
 
     def see(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Take note of the next frame, about which :meth:`calls_for` is asked.
-
-        Its sharpness is measured while it is tracked.
-        """
+        """Register the next frame for :meth:`calls_for`; its sharpness is measured in the
+        background."""
         self._concurrent.start(lambda: self._note(sharpness(image)))
 
     def settle(self) -> None:
-        """Wait until the latest frame has been noted."""
+        """Wait for the sharpness of the latest frame."""
         self._concurrent.wait()
 
     def calls_for(self, seen: SeenMotion, near: bool = False) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
 
-        A frame that is blurred compared with the latest ones waits for a sharper one, though not
-        for long: nothing else sees what comes into view meanwhile. ``near`` says that
-        :func:`is_near_end`. Where the mean flow decides, neither counts.
+        A blurred frame waits for a sharper one, but not for long: no other keyframe sees what comes
+        into view meanwhile. ``near``: result of :func:`is_near_end`. Where the mean flow decides,
+        neither counts.
         """
         if self.config.keyframe_mean_flow > 0:
             return calls_for_keyframe(self.config, self.grid, seen)

@@ -1,4 +1,4 @@
-"""A depth sensor in the tracker: what it says of a keyframe's cells."""
+"""Depth sensors in the tracker: depths of a keyframe's cells."""
 
 import torch
 
@@ -12,16 +12,16 @@ from geogs.world.keyframes import Keyframe
 
 
 class KeyframeDepthSensor:
-    """Gives keyframes the depth that a sensor measured, in metres."""
+    """Sets sensor depths of keyframes, in metres."""
 
     def __init__(self, grid: SampleGrid, config: DepthSensorConfig) -> None:
         self.grid = grid
         self.config = config
 
     def start(self, keyframe: Keyframe, depth: MeasuredDepth | None, least: float) -> bool:
-        """Give a first keyframe depths; False, and nothing done, where too few are known.
+        """Set the depths of a first keyframe; False, without changes, where too few are known.
 
-        Cells that the sensor does not know are filled from those around, without information.
+        Cells without sensor depth are filled from those around, without information.
         """
         measured = self._measure(keyframe, depth)
         if measured is None:
@@ -35,7 +35,7 @@ class KeyframeDepthSensor:
         return True
 
     def join(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> None:
-        """Let a new keyframe know what was measured, over the depth it was given by others."""
+        """Set sensor depths of a new keyframe, in place of propagated ones."""
         measured = self._measure(keyframe, depth)
         if measured is None:
             return
@@ -46,7 +46,7 @@ class KeyframeDepthSensor:
         keyframe.information = information
 
     def _measure(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> MeasuredCells | None:
-        """Keep the picture and what it says of the cells, which is returned, if there is one."""
+        """Store the depth image, if any, and return its values at the cells."""
         metres = None if depth is None else depth.metres()
         if metres is None:
             return None

@@ -1,4 +1,4 @@
-"""Monocular priors in the tracker: asked for at every keyframe, then adjusted with its depth."""
+"""Monocular priors in the tracker: predicted for every keyframe, then adjusted with its depth."""
 
 import logging
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 from geogs.world.keyframes import Keyframe
 
 CAUTION = 4.0
-"""Factor on the deviation that mapping is given of a prior, since it takes a tracker's deviations
-for larger than they are (``DEVIATION_SCALE``, ``TRACKER_SCALE`` of depth/)."""
+"""Factor on a prior's deviation for mapping, which assumes that a tracker's deviations are
+overestimated (``DEVIATION_SCALE``, ``TRACKER_SCALE`` of depth/)."""
 
 _log = logging.getLogger(__name__)
 
 
 class KeyframePriors:
-    """Gives keyframes their priors and lets these fill in what matches say little about.
+    """Adds priors to keyframes and adjusts depth with them where matches determine little.
 
-    Without a prior nothing is ever done.
+    Does nothing without a prior.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class KeyframePriors:
         self._warned = False
 
     def ask(self, keyframe: Keyframe) -> None:
-        """Let the prior look at a new keyframe; of a depth that was measured it is not asked."""
+        """Predict the prior of a new keyframe; no depth where it was measured by a sensor."""
         if self.prior is None:
             return
         maps, grid = self.prior.predict(keyframe.image), self.graph.keyframes.grid
@@ -51,7 +51,7 @@ class KeyframePriors:
             keyframe.prior = KeyframePrior(maps.kind, values, zero, one, zero)
 
     def _facing(self, normal: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """Normals that face the camera; zero instead of those that cannot be."""
+        """Return normals that face the camera; zero in place of others."""
         away = (normal * self.graph.keyframes.grid.camera.rays()).sum(-1, keepdim=True) >= 0
         known = normal.square().sum(-1, keepdim=True) > 0
         if not self._warned and int((away & known).sum()) > 0.5 * int(known.sum()):
@@ -60,7 +60,7 @@ class KeyframePriors:
         return torch.where(away, 0.0, normal)
 
     def adjust(self, ids: Sequence[int]) -> None:
-        """Joint depth and scale adjustment of those keyframes that have a prior, poses fixed."""
+        """Adjust depth and scale of the keyframes that have a prior jointly, poses fixed."""
         store, deep = self.graph.keyframes, set(ids)
         edges = [e for e in self.graph.edges if e[0] in deep and store[e[0]].prior is not None]
         if not edges:
@@ -97,9 +97,9 @@ class KeyframePriors:
         inverse_depth: Float[Tensor, "p"],
         curvature: Float[Tensor, "p"],
     ) -> None:
-        """Bring a prior to the tracker's unit: once, and a shift again whenever depth is better.
+        """Align a prior to the tracker's unit: once, or again at every call if it has a shift.
 
-        The scales stand for a scale alone, so one that has them needs no second alignment.
+        The adjusted scales replace a second alignment of scale.
         """
         if prior.is_aligned and not prior.kind.has_shift:
             return
@@ -112,6 +112,6 @@ class KeyframePriors:
 
 
 def on_cells(grid: SampleGrid, values: Float[Tensor, "h w"]) -> Float[Tensor, "p"]:
-    """Values of an image-sized map at the pixels of the cells."""
+    """Sample an image-sized map at the pixels of the cells."""
     rows = values[OFFSET : OFFSET + STRIDE * grid.height : STRIDE]
     return rows[:, OFFSET : OFFSET + STRIDE * grid.width : STRIDE].reshape(-1).float()

@@ -1,4 +1,4 @@
-"""Fixed keyframes of a saved map, at which a camera can be found again."""
+"""Fixed keyframes of a saved map, for relocalisation."""
 
 from collections.abc import Sequence
 
@@ -14,13 +14,13 @@ from geogs.world.keyframes import KeyframeSet
 from geogs.world.segments import TrackState, VideoSegment
 
 DEVIATION = 0.01
-"""Relative deviation of a depth that a map shows, where it is confident."""
+"""Relative deviation of a map's rendered depth, where its confidence is 1."""
 ONE_SURFACE = 1.1
-"""Ratio up to which the depths of four neighbouring pixels count as those of one surface."""
+"""Largest ratio of the depths of four neighbouring pixels on one surface."""
 
 
 def add_saved_keyframes(segment: VideoSegment, saved: Sequence[RenderedKeyframe]) -> list[int]:
-    """Begin a segment in the gauge of a saved map, whose keyframes stay fixed; returns their ids.
+    """Begin a segment in the gauge of a saved map with fixed keyframes; return their ids.
 
     The camera is lost there until a frame is recognised at one of them.
 
@@ -34,7 +34,7 @@ def add_saved_keyframes(segment: VideoSegment, saved: Sequence[RenderedKeyframe]
 
 
 def _add(keyframes: KeyframeSet, saved: RenderedKeyframe, frame_index: int) -> int:
-    """Add a keyframe with the depth of a saved map; returns its id."""
+    """Add a keyframe with the depth of a saved map; return its id."""
     grid, encode = keyframes.grid, keyframes.table.encode
     if saved.image is None:
         raise InputError("The map was saved without the images of its keyframes.")
@@ -57,7 +57,7 @@ def _add(keyframes: KeyframeSet, saved: RenderedKeyframe, frame_index: int) -> i
 def depth_on_grid(
     grid: SampleGrid, saved: RenderedKeyframe
 ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-    """Inverse depth of the cells, and how far it is to be trusted; both 0 where it is not known.
+    """Return inverse depth of the cells and its confidence; both 0 where unknown.
 
     Inverse depth is linear over the image of a plane, so it is interpolated; not across an edge.
     """

@@ -1,4 +1,4 @@
-"""Keyframes of a segment with all that comes with them: edges, priors, measured depth, log."""
+"""Keyframes of a segment with their edges, priors, sensor depth and log."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,7 +22,7 @@ from geogs.world.segments import VideoSegment
 
 
 class SegmentMap:
-    """Adds keyframes to a segment and removes them, so that all that is kept of them agrees."""
+    """Adds keyframes to a segment and removes them, keeping all their data consistent."""
 
     def __init__(
         self,
@@ -41,18 +41,18 @@ class SegmentMap:
 
     @property
     def operator(self) -> FlowOperator:
-        """Measures the flow between images."""
+        """Flow operator."""
         return self.graph.operator
 
     def add(self, frame: Frame, encoded: Any, T_cw: Float[Tensor, "4 4"] | None = None) -> Keyframe:
-        """Make a frame a keyframe at a pose, the identity if none is given; depths are unknown."""
+        """Make a frame a keyframe at a pose (default: identity); depths are unknown."""
         T_cw = torch.eye(4, dtype=torch.float64) if T_cw is None else T_cw
         keyframe = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, T_cw)
         keyframe.pose = frame.pose
         return keyframe
 
     def complete(self, keyframe: Keyframe, rotations: Sequence[RelativeRotation]) -> None:
-        """Ask the prior about a new keyframe, and log its frame."""
+        """Predict the prior of a new keyframe, and log its frame."""
         self.priors.ask(keyframe)
         self.recorder.add_keyframe(keyframe, rotations)
 
@@ -62,13 +62,13 @@ class SegmentMap:
         self.recorder.keyframe_removed(self.keyframes.remove(id), substitute)
 
     def forget(self, ids: Sequence[int]) -> None:
-        """Give up keyframes, whose frames then have no pose."""
+        """Drop keyframes; their frames then have no pose."""
         for id in ids:
             self.graph.remove_keyframe(id)
             self.recorder.keyframe_forgotten(self.keyframes.remove(id))
 
     def restore(self, record: FrameRecord, id: int | None, T_cw: Float[Tensor, "4 4"]) -> Keyframe:
-        """Make a frame that waits a keyframe: again, by the id that it had; else the latest."""
+        """Make a waiting frame a keyframe: again with its former ``id``, or as the latest."""
         assert record.image is not None, "a frame that does not wait has no image"
         encoded = self.recorder.encoded(record)
         keyframe = self.keyframes.add(
@@ -79,7 +79,7 @@ class SegmentMap:
         return keyframe
 
     def finalise(self, ids: Sequence[int]) -> tuple[int, ...]:
-        """Let keyframes be removed no more; returns those that could be until now."""
+        """Make keyframes final; return those that were not final before."""
         final = self.segment.final
         known = set(final)
         fresh = tuple(k for k in ids if k not in known)

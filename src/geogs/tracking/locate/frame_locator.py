@@ -1,4 +1,4 @@
-"""The motion of one frame against a keyframe of known depth."""
+"""Pose of one frame relative to a keyframe of known depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 MIN_KNOWN = 0.1
-"""The camera's position is not known when the depth of less than this fraction of a keyframe is
-known to 30 % and found in the image: then it is followed as if it only rotated."""
+"""Least fraction of a keyframe's cells whose depth is known to 30 % and matched in the image for
+the camera's position to be known; below it only the rotation is tracked."""
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
 FIT_HUBER = 5.0
-"""Standard deviations of the flow beyond which a match counts linearly in it."""
+"""Huber threshold of this adjustment, in standard deviations of the flow."""
 MAX_DIFFERENCE = 1.0
-"""Pixels by which matches of two ways to the same place differ in the median at most; those of two
-repetitions of a pattern differ by its period."""
+"""Largest median difference, in pixels, of matches from two searches that found the same pose; for
+two repetitions of a pattern they differ by its period."""
 DOUBTFUL_OVERLAP = 0.7
-"""A frame near where it was expected is also looked for without a guess where less than this
-fraction of the keyframe's known depths agrees: a guess that is off by half a period of a pattern
-leads to the wrong one of its repetitions, which agree over a part of the image."""
+"""Fraction of the keyframe's known depths that agrees with a predicted pose, below which the frame
+is also searched for without a guess: a guess off by half a period of a pattern leads to the wrong
+repetition, which agrees over a part of the image."""
 CONFIRMED_NCC = 0.95
-"""Correlation of the images' windows from which a pose to which flow leads with a guess and without
-needs no third opinion. Of 32 wrong poses before rendered chessboards 3 are left so, as where
-features are always asked, and 9 where both ways are enough; a real corridor has 0.97."""
+"""Correlation of the images' windows above which a pose found by flow both with and without a guess
+is accepted without features. Of 32 wrong poses before rendered chessboards 3 remain, as with
+features always, against 9 if both searches are enough; a real corridor has 0.97."""
 FEATURE_CANDIDATES = 2
-"""Keyframes with which the features of a frame are compared when the camera is lost."""
+"""Keyframes whose features are matched with a frame when the camera is lost."""
 
 
 @dataclass(frozen=True)
@@ -46,32 +46,32 @@ class FrameMotion:
 
     keyframe: int
     T_cw: Float[Tensor, "4 4"]
-    """float64."""
+    """World to camera, float64."""
     match: FlowMatch
     """One edge, keyframe -> frame."""
     flow: float
     """Median motion of the matched cells in pixels."""
     parallax: float
-    """Median of that motion without what the camera's rotation does: what tells depth."""
+    """Median of that motion without the camera's rotation, which determines depth."""
     matched: float
     """Fraction of the keyframe's cells with a match that agrees with the pose."""
     overlap: float
-    """The same of those of its cells whose depth is known."""
+    """The same fraction of its cells with known depth."""
     known: float
-    """Fraction of the keyframe's cells that are matched and whose depth is known well enough to
-    tell where the camera is."""
+    """Fraction of the keyframe's cells that are matched, with a depth known well enough to locate
+    the camera."""
     residual: float
     """Median distance in pixels between matches and reprojection."""
     check: PhotometricCheck
-    """How well the images agree there."""
+    """Agreement of the images at this pose."""
 
     @property
     def seen(self) -> SeenMotion:
-        """What says whether the frame becomes a keyframe."""
+        """Criteria for a new keyframe."""
         return SeenMotion(self.flow, self.overlap, self.match, self.parallax)
 
     def is_where(self, other: "FrameMotion") -> bool:
-        """Whether matches of the same keyframe say the same as another's, in the median."""
+        """Whether the median difference from another pose's matches of the keyframe is small."""
         both = self.match.sure()[0] & other.match.sure()[0]
         off = (self.match.pixels - other.match.pixels)[0, both].norm(dim=-1)
         return len(off) > 0 and float(off.median()) < MAX_DIFFERENCE
@@ -79,7 +79,7 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class Recognition:
-    """A keyframe that shows what an image shows."""
+    """A keyframe recognised in an image."""
 
     keyframe: int
     T_rel: Float[Tensor, "4 4"]
@@ -87,9 +87,9 @@ class Recognition:
 
 
 class FrameLocator:
-    """Finds the pose of a frame from flow against keyframes, by motion-only adjustment.
+    """Estimates the pose of a frame from flow against keyframes, by motion-only adjustment.
 
-    A pose is believed where enough of the flow agrees with it, and the images do.
+    A pose is accepted if enough of the flow agrees with it, and it passes the photometric check.
     """
 
     def __init__(
@@ -113,9 +113,9 @@ class FrameLocator:
         T_guess: Float[Tensor, "4 4"],
         is_expected: bool = True,
     ) -> FrameMotion | None:
-        """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose.
+        """Estimate the pose of a frame near ``T_guess``; None if too few matches agree with any.
 
-        A frame that was not expected there has to pass the photometric check; one that was, only
+        A frame that was not expected there has to pass the photometric check; an expected one only
         where there is texture.
         """
         forward, backward = grid_fields(self.grid).reproject([keyframe], [T_guess])
@@ -131,10 +131,10 @@ class FrameLocator:
         T_second: Float[Tensor, "4 4"],
         T_first: Float[Tensor, "4 4"],
     ) -> tuple[FrameMotion | None, FrameMotion | None]:
-        """The second on the first's depth, and the first on the second's, from one measurement.
+        """Locate each of two keyframes on the other's depth, by one flow measurement.
 
-        ``T_second`` is about where the second is in the world of the first, ``T_first`` the other
-        way round; the two may differ in scale. Neither was expected.
+        ``T_second`` is an initial pose of the second in the world of the first, ``T_first`` the
+        other way round; the two may differ in scale. Neither counts as expected.
         """
         expected, _ = grid_fields(self.grid).reproject([first, second], [T_second, T_first])
         there, back = self.operator.measure(
@@ -153,7 +153,7 @@ class FrameLocator:
         match: FlowMatch,
         is_expected: bool = True,
     ) -> FrameMotion | None:
-        """The same as :meth:`locate`, by flow from the keyframe that has been measured."""
+        """Do the same as :meth:`locate`, by flow that has already been measured."""
         T, T_ji, fit = motion_solver(self.grid).fit(
             T_guess,
             keyframe,
@@ -171,7 +171,7 @@ class FrameLocator:
             keyframe.inverse_depth,
             keyframe.information,
         )
-        # All at once, so that a GPU is waited for once.
+        # Copied at once, to wait for a GPU only once.
         found = torch.cat([T.reshape(-1), fit.to(T), seen.to(T)]).cpu()
         _, agree, residual, flow, parallax, informed, known = found[16:23].tolist()
         check = PhotometricCheck.of(found[23:25])
@@ -188,28 +188,28 @@ class FrameLocator:
     def locate_relative(
         self, keyframe: Keyframe, encoded: Any, T_rel: Float[Tensor, "4 4"] | None
     ) -> FrameMotion | None:
-        """Pose of a frame that was not expected near a guess relative to a keyframe, if any."""
+        """Estimate the pose of an unexpected frame near a guess relative to a keyframe, if any."""
         if T_rel is None:
             return None
         T_guess = T_rel.to(keyframe.T_cw) @ keyframe.T_cw
         return self.locate(keyframe, encoded, T_guess, is_expected=False)
 
     def relocate(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
-        """Pose of a frame about which nothing is known, by flow from a cold start and PnP."""
+        """Estimate the pose of a frame without a guess, by flow from a cold start and PnP."""
         there, _ = self.operator.measure([keyframe.encoded], [encoded], fine=False)
         good = there.sure()[0] & (keyframe.information > 0)
         T_rel = pnp(self.grid, keyframe.inverse_depth, there.pixels[0], good)
         return self.locate_relative(keyframe, encoded, T_rel)
 
     def relocate_by_features(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
-        """The same as :meth:`relocate`, by sparse features: the motion may be of any size."""
+        """Do the same as :meth:`relocate`, by sparse features: the motion may be of any size."""
         grey = self.operator.grey
         found = match_features(grey(keyframe.encoded), grey(encoded))
         T_rel = None if found is None else pnp_features(self.grid, keyframe, found)
         return self.locate_relative(keyframe, encoded, T_rel)
 
     def relocate_any(self, keyframes: Sequence[Keyframe], encoded: Any) -> FrameMotion | None:
-        """The first success of :meth:`relocate` over several keyframes, the likeliest first.
+        """Return the first success of :meth:`relocate` over several keyframes, likeliest first.
 
         Where all fail, features are tried with the first ``FEATURE_CANDIDATES`` of them.
         """
@@ -221,8 +221,8 @@ class FrameLocator:
     def best(
         self, keyframe: Keyframe, encoded: Any, expected: FrameMotion | None
     ) -> FrameMotion | None:
-        """The frame where most of the keyframe agrees: as expected, or where nothing but the
-        images led, if that was doubtful; features are asked where flow led elsewhere."""
+        """Return the pose with which most of the keyframe agrees: the expected one or, if that is
+        doubtful, one found without a guess; features are used where flow found another pose."""
         if expected is None or expected.overlap >= DOUBTFUL_OVERLAP:
             return expected
         cold = with_depth(self.relocate(keyframe, encoded))
@@ -236,5 +236,5 @@ class FrameLocator:
 
 
 def with_depth(motion: FrameMotion | None) -> FrameMotion | None:
-    """A motion that enough cells of known depth say."""
+    """Return a motion if enough cells of known depth support it, else None."""
     return None if motion is None or motion.known < MIN_KNOWN else motion

@@ -1,4 +1,4 @@
-"""Where the camera is in a started map: near where it was, or anywhere when it is lost."""
+"""Localisation of the camera in a started map: near its last pose, or anywhere when it is lost."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,20 +17,20 @@ from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
 
 MAX_RESIDUAL = 0.008
-"""The camera is lost when the median reprojection error exceeds this, of the long edge."""
+"""Median reprojection error above which the camera is lost, as a fraction of the long edge."""
 MIN_RECOGNISED = 0.25
-"""A keyframe that an image was recognised as counts if this fraction of it finds a match: twice
-what is asked where the camera was expected."""
+"""Fraction of a recognised keyframe's cells that must be matched: twice the fraction required where
+the camera was expected."""
 MAX_TRIED = 5
 """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
 MAX_FACING, MAX_VISIBLE = 12, 2
-"""Keyframes that face most nearly the same way as a camera, and those of them that see most of the
-same, which are worth a measurement."""
+"""Keyframes whose viewing direction is nearest to a camera's, and those of them with the largest
+overlap, which are matched."""
 MIN_OVERLAP = 0.15
 """Fraction of a keyframe's cells that must have known depth and fall into the image."""
 RELOCALISE_EVERY = 5
-"""While a camera only rotates, its orientation says what it sees; only every so many frames it is
-searched for as if it could be anywhere."""
+"""Interval in frames of a search in the whole map while a camera only rotates; otherwise its
+orientation gives the view."""
 
 
 class SegmentLocaliser:
@@ -43,7 +43,7 @@ class SegmentLocaliser:
         self.locator = FrameLocator(grid, map.operator, MIN_MATCHED, max_residual, MIN_NCC)
 
     def track(self, frame: Frame, encoded: Any) -> FrameMotion | None:
-        """The frame near where the last one was; None if the camera is not there."""
+        """Locate the frame near the last one; None if the camera is not there."""
         last = self.map.segment.status.last
         if last is None:
             return None
@@ -58,7 +58,7 @@ class SegmentLocaliser:
         return self.locator.best(keyframe, encoded, with_depth(motion))
 
     def relocalise(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
-        """The frame anywhere: first where the camera would be if it had only rotated."""
+        """Locate the frame anywhere: first at the pose of a pure rotation."""
         status, keyframes = self.map.segment.status, list(self.map.keyframes)
         last = status.last
         if last is not None and followed is not None and followed.R is not None:
@@ -74,9 +74,9 @@ class SegmentLocaliser:
         return with_depth(self.locator.relocate_any(self._candidates(keyframes), encoded))
 
     def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
-        """The frame at one of some keyframes that look like it.
+        """Locate the frame at one of some recognised keyframes.
 
-        One is believed where the dense flow agrees with it over ``MIN_RECOGNISED`` of the cells.
+        One is accepted if the dense flow agrees with it over ``MIN_RECOGNISED`` of the cells.
         """
         for candidate in recognised:
             if candidate.keyframe not in self.map.keyframes:
@@ -88,14 +88,14 @@ class SegmentLocaliser:
         return None
 
     def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
-        """Where to search for a lost camera: recent keyframes, and older ones by turns."""
+        """Return keyframes to search for a lost camera: recent ones, and older ones in turn."""
         recent, older = keyframes[: -MAX_TRIED - 1 : -1], keyframes[:-MAX_TRIED]
         first = (self.map.segment.status.misses * MAX_TRIED) % max(len(older), 1)
         return recent + (older[first:] + older[:first])[:MAX_TRIED]
 
 
 def visible_keyframes(keyframes: Sequence[Keyframe], T_cw: Float[Tensor, "4 4"]) -> list[Keyframe]:
-    """The keyframes most of whose known depth falls into the image of a camera, best first."""
+    """Return the keyframes most of whose known depth falls into a camera's image, best first."""
     if not keyframes:
         return []
     axis = T_cw[2, :3]

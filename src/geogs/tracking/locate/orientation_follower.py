@@ -1,4 +1,4 @@
-"""Follows the orientation of a camera where there is no depth to locate it by."""
+"""Tracking of a camera's orientation where there is no depth to locate it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import OrientationTrack, ReferenceView
 
 MAX_MISSES = 5
-"""Frames that do not match the view after which the next one replaces it, without a link."""
+"""Frames without a match after which the next frame replaces the view, without a link."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,15 @@ class Followed:
     """Orientation of a frame."""
 
     rotation: RelativeRotation
-    """Relative to the view it was matched with."""
+    """Rotation relative to the matched view."""
     R: Float64[Tensor, "3 3"] | None
-    """The camera that was located last to this frame; none where nothing links them."""
+    """Rotation from the camera located last to this frame; None where no motion links them."""
     is_pure: bool
-    """Whether nothing speaks for more than a rotation."""
+    """Whether the motion is explained by a rotation alone."""
 
 
 class OrientationFollower:
-    """Matches each frame with one view before it, and takes another when that leaves the image.
+    """Matches each frame with an earlier view, which is replaced when it leaves the image.
 
     So the error grows with the number of views, not with that of frames.
     """
@@ -43,12 +43,12 @@ class OrientationFollower:
         self.grid, self.operator, self.config = grid, operator, config
 
     def located(self, track: OrientationTrack, frame: Frame, encoded: Any) -> None:
-        """The frame has a pose: what follows may be matched with it."""
+        """Use a located frame as the view for later ones."""
         eye = torch.eye(3, dtype=torch.float64)
         track.reset(ReferenceView(frame.index, frame.image, eye, encoded))
 
     def follow(self, track: OrientationTrack, frame: Frame, encoded: Any) -> Followed | None:
-        """Rotation of the next frame relative to the view; None if that is not known."""
+        """Estimate the rotation of the next frame relative to the view; None if not possible."""
         view = track.view
         if view is None:
             track.reset(ReferenceView(frame.index, frame.image, None, encoded))

@@ -1,4 +1,4 @@
-"""How well a frame's pose is known, by the matches that located it."""
+"""Standard deviations of a frame's pose, from the matches that located it."""
 
 from collections.abc import Callable
 from copy import copy
@@ -19,7 +19,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 DeviationOf = Callable[[], "PoseDeviation"]
-"""Computes a deviation, which takes as long as a good part of a frame."""
+"""Function that computes a deviation; it takes a considerable part of a frame's time."""
 
 
 @dataclass(frozen=True)
@@ -27,19 +27,19 @@ class PoseDeviation:
     """Standard deviations of a pose relative to the keyframe it was located at."""
 
     position: float
-    """The camera's centre, all axes together, map units; infinite where nothing is known."""
+    """Deviation of the camera centre, all axes together, map units; infinite where unknown."""
     rotation: float
-    """The camera's orientation, radians."""
+    """Deviation of the camera's orientation, radians."""
 
 
 def pose_deviation(
     grid: SampleGrid, keyframe: Keyframe, T_rel: Float[Tensor, "4 4"], match: FlowMatch
 ) -> PoseDeviation:
-    """Deviations of the pose of a frame at ``T_rel`` from a keyframe, by the one edge between them.
+    """Return the deviations of a frame's pose at ``T_rel`` from a keyframe, by the edge between.
 
     The inverse of sum J^T W J over the cells, J the derivative of a cell's position by a left
-    perturbation of the pose, and 1 / W the variance of its match and of what its depth's does to
-    it; times ``ALIKE``, as neighbours err alike.
+    perturbation of the pose, and 1 / W the variance of its match plus that due to its depth; times
+    ``ALIKE``, as errors of neighbours are correlated.
     """
     p = linearise(grid.camera, grid.rays, T_rel[None].to(grid.device), keyframe.inverse_depth[None])
     known = keyframe.confident_information[None]
@@ -49,9 +49,9 @@ def pose_deviation(
 
 
 def left_open(H: Float[Tensor, "6 6"]) -> PoseDeviation:
-    """Deviations of a pose by the normal equations of its left perturbation; float64, on the CPU.
+    """Return the deviations of a pose from normal equations of its left perturbation; float64, CPU.
 
-    Infinite where these leave a direction open.
+    Infinite where these are singular.
     """
     scale = H.diagonal().clamp(min=1e-30).rsqrt()
     inverse, failed = torch.linalg.inv_ex(scale[:, None] * H * scale)
@@ -63,6 +63,6 @@ def left_open(H: Float[Tensor, "6 6"]) -> PoseDeviation:
 
 
 def deviation_of(grid: SampleGrid, keyframe: Keyframe, motion: FrameMotion) -> DeviationOf:
-    """Computes the same later of a frame located at a keyframe, by what is known now."""
+    """Return a function that computes :func:`pose_deviation` later from the present state."""
     T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw).to(motion.T_cw)
     return partial(pose_deviation, grid, copy(keyframe), T_rel, motion.match)

@@ -1,4 +1,4 @@
-"""Flow followed from a first image through those after it, while no depth is known."""
+"""Flow chained from a first image through the following ones, while no depth is known."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,14 +20,14 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
 
 MIN_TEXTURE = 0.05
-"""A frame is skipped when less than this fraction of it has structure."""
+"""Textured fraction below which a frame is skipped."""
 MIN_MATCHED = 0.12
-"""The camera is lost when less than this fraction of a keyframe finds a match."""
+"""Matched fraction of a keyframe below which the camera is lost."""
 
 
 @dataclass(frozen=True)
 class ChainedMatch:
-    """The motion of a frame since the last keyframe while no depth is known."""
+    """Motion of a frame since the last keyframe while no depth is known."""
 
     there: FlowMatch
     """One edge, keyframe -> frame."""
@@ -36,27 +36,27 @@ class ChainedMatch:
     flow: float
     """Median motion of the matched cells in pixels."""
     matched: float
-    """Fraction of the cells that are matched; 0 where the images do not agree there."""
+    """Fraction of the cells that are matched; 0 where the photometric check fails."""
 
     @property
     def seen(self) -> SeenMotion:
-        """What says whether the frame becomes a keyframe."""
+        """Criteria for a new keyframe."""
         return SeenMotion(self.flow, self.matched, self.there)
 
 
 def follow_flow(
     grid: SampleGrid, operator: FlowOperator, chain: ChainedPositions, first: Any, encoded: Any
 ) -> ChainedMatch:
-    """Match the first image with the next one, from where ``chain`` has come to; it goes on there.
+    """Match the first image with the next one, starting from ``chain``, which is updated.
 
     Both images are encoded.
     """
     there, back = operator.measure([first], [encoded], chain.there, chain.back, fine=False)
     there, back = guided_flow(grid, operator, first, encoded, there, back)
-    # What the images say where the flow, for want of a pose, leads.
+    # Photometric check at the flow's positions, for want of a pose.
     seen = correlation_matched(grid, operator.grey(first), operator.grey(encoded), there.pixels[0])
     moved = matched_motion(grid, there.pixels[0], there.weight[0])
-    # All at once, so that a GPU is waited for once.
+    # Copied at once, to wait for a GPU only once.
     found = torch.cat([moved, seen]).cpu()
     matched, flow = found[:2].tolist()
     if not PhotometricCheck.of(found[2:]).passes(MIN_NCC, is_expected=True):

@@ -1,9 +1,8 @@
-"""Photometric check of a location: whether the images agree at a pose.
+"""Photometric check of a pose: whether two images agree at it.
 
-A flow that was smoothed agrees with itself, there and back, even between images that have nothing
-in common; that it does is no evidence. What two images show of one surface is: the window around a
-cell of the one correlates with what the other shows where the pose and the depth, not the flow, put
-it.
+A smoothed flow agrees with itself, there and back, even between images that have nothing in common,
+so that is no evidence. The images themselves are: if they show the same surface, the window around
+a cell of the first correlates with the second image where pose and depth, not the flow, project it.
 """
 
 from dataclasses import dataclass
@@ -20,21 +19,21 @@ from geogs.world.grid import STRIDE, SampleGrid
 SIDE = STRIDE + 1
 """Pixels along the edge of a window; those of neighbouring cells share their border."""
 MIN_NCC = 0.5
-"""A frame counts as located where the images agree: least median correlation (NCC) of windows of
-9 x 9 pixels, reprojected by pose and depth. Unlike images come to 0, one position to 0.7 and more.
-Where too few windows have texture the flow alone decides whether the camera is still where it was
-followed to; a map is never started, nor a camera found again, without evidence."""
+"""Least median correlation (NCC) of windows of 9 x 9 pixels, reprojected by pose and depth, for a
+frame to count as located. Different scenes give 0, the same position 0.7 and more. Where too few
+windows have texture, flow alone decides whether the camera is still near its expected pose; but no
+map is started, and no camera relocalised, without this check."""
 MIN_CONTRAST = 2.0
-"""Standard deviation in grey levels of a window with texture, after smoothing."""
+"""Least standard deviation in grey levels of a window with texture, after smoothing."""
 MAX_WINDOWS = 512
-"""Most windows that are compared, evenly spread; more would hardly move their median."""
+"""Most windows that are compared, evenly spread; more would hardly change their median."""
 MIN_WINDOWS = 24
-"""Fewest windows whose median says something."""
+"""Fewest windows whose median is meaningful."""
 
 
 @dataclass(frozen=True)
 class PhotometricCheck:
-    """How well the images agree at a location."""
+    """Agreement of two images at a pose."""
 
     correlation: float
     """Median normalised cross-correlation (NCC) of the windows, in [-1, 1]; 0 without any."""
@@ -43,15 +42,14 @@ class PhotometricCheck:
 
     @staticmethod
     def of(numbers: Float[Tensor, "2"]) -> "PhotometricCheck":
-        """The check of what :func:`correlation_at` returns; waits for a GPU."""
+        """Make a check from the result of :func:`correlation_at`; waits for a GPU."""
         correlation, windows = numbers.tolist()
         return PhotometricCheck(correlation, int(windows))
 
     def passes(self, min_correlation: float, is_expected: bool) -> bool:
-        """Whether a location is to be believed.
+        """Whether a pose is accepted.
 
-        With too few windows the images say nothing. Then one is believed only where it ``is
-        expected``: near the one before it.
+        With too few windows a pose is only accepted if ``is_expected``: near the one before it.
         """
         if self.windows < MIN_WINDOWS:
             return is_expected
@@ -66,10 +64,11 @@ def correlation_at(
     inverse_depth: Float[Tensor, "p"],
     information: Float[Tensor, "p"],
 ) -> Float[Tensor, "2"]:
-    """The numbers of a :class:`PhotometricCheck`, of two images in grey levels at a relative pose.
+    """Compute the numbers of a :class:`PhotometricCheck` for two grey images at a relative pose.
 
-    Depth is the first's, and unknown where it has no information. All tensors but the pose, which
-    may be on the CPU, are on the grid's device; so is the result, and nothing waits for a GPU.
+    Depth is the first's, and unknown where it has no information. All tensors except the pose,
+    which may be on the CPU, are on the grid's device; so is the result, and nothing waits for a
+    GPU.
     """
     if grid.on_gpu:
         from geogs.tracking.cuda.photometric_check import median_correlation
@@ -87,9 +86,9 @@ def correlation_matched(
     second: Float[Tensor, "h w"],
     pixels: Float[Tensor, "p 2"],
 ) -> Float[Tensor, "2"]:
-    """:func:`correlation_at` where no pose is known: cells lie at ``pixels`` of the second.
+    """Do :func:`correlation_at` without a pose: cells lie at ``pixels`` of the second image.
 
-    Says less, since a flow leads where images look alike; but it cannot make them alike.
+    A weaker test, since flow leads to similar positions; but it cannot make images similar.
     """
     if grid.on_gpu:
         from geogs.tracking.cuda.photometric_check import median_correlation
@@ -105,7 +104,7 @@ def correlation_matched(
 def matched_motion(
     grid: SampleGrid, pixels: Float[Tensor, "p 2"], weight: Float[Tensor, "p 2"]
 ) -> Float[Tensor, "2"]:
-    """Fraction of the cells that are matched, and their median motion in pixels, 0 without any.
+    """Return the fraction of matched cells, and their median motion in pixels, 0 without any.
 
     On a GPU both stay there, and nothing waits.
     """
@@ -121,10 +120,10 @@ def matched_motion(
 def reprojected_windows(
     grid: SampleGrid, T_ji: Float[Tensor, "4 4"], inverse_depth: Float[Tensor, "p"]
 ) -> Float[Tensor, "n s 2"]:
-    """Where a second view sees the windows around some cells of the first, pixel by pixel.
+    """Project the windows around some cells of the first view into a second, pixel by pixel.
 
-    The surface in a window is taken to have its cell's depth: the window is rotated, scaled and
-    sheared as that plane is. Pixels that are not before the second camera are not finite.
+    The surface in a window is assumed to have its cell's depth: the window is rotated, scaled and
+    sheared like that plane. Pixels that are not in front of the second camera are not finite.
     """
     c, some = grid.camera, _spread(grid)
     R, t = T_ji[:3, :3].to(grid.rays), T_ji[:3, 3].to(grid.rays)
@@ -142,7 +141,7 @@ def _median_correlation(
     positions: Float[Tensor, "n s 2"],
     known: Bool[Tensor, "n"],
 ) -> Float[Tensor, "2"]:
-    """Median NCC of the known windows with texture in the first image that the second shows."""
+    """Return the median NCC of the known, textured windows of the first image in view of both."""
     sides = (grid.camera.width - 1, grid.camera.height - 1)
     position = torch.stack([positions[..., k] * (2 / sides[k]) - 1 for k in (0, 1)], -1)
     seen = (position.abs() <= 1).flatten(1).all(1)
@@ -155,14 +154,14 @@ def _median_correlation(
 
 
 def _windows(grid: SampleGrid, image: Float[Tensor, "h w"]) -> Float[Tensor, "n s"]:
-    """Windows around some cells; the border is repeated where one ends a pixel outside."""
+    """Return windows around some cells; the border is replicated where one ends a pixel outside."""
     image = functional.pad(image[None, None], (0, 1, 0, 1), mode="replicate")[0, 0]
     every = image.unfold(0, SIDE, STRIDE).unfold(1, SIDE, STRIDE)
     return every.reshape(grid.size, SIDE**2)[_spread(grid)]
 
 
 def _smoothed(windows: Float[Tensor, "n s"]) -> Float[Tensor, "n r"]:
-    """Means of 3 x 3 pixels about the window's mean: what noise and half a pixel change little."""
+    """Return 3 x 3 means less the window's mean, robust to noise and half-pixel shifts."""
     x = windows.reshape(-1, SIDE, SIDE)
     x = x[:, :-2] + x[:, 1:-1] + x[:, 2:]
     x = (x[..., :-2] + x[..., 1:-1] + x[..., 2:]).flatten(1) / 9
@@ -170,7 +169,7 @@ def _smoothed(windows: Float[Tensor, "n s"]) -> Float[Tensor, "n r"]:
 
 
 def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, "2"]:
-    """Lower median of the values that count, 0 without any, and their number.
+    """Return the lower median of the values that count, 0 without any, and their number.
 
     ``torch.nanmedian`` would wait for the GPU.
     """
@@ -181,7 +180,7 @@ def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Floa
 
 
 def _spread(grid: SampleGrid) -> slice:
-    """Every k-th cell, row by row: no more than are compared, and from all columns."""
+    """Return a slice of every k-th cell, row by row: at most ``MAX_WINDOWS``, from all columns."""
     step = -(-grid.size // MAX_WINDOWS)
     while gcd(step, grid.width) > 1:
         step += 1
@@ -189,6 +188,6 @@ def _spread(grid: SampleGrid) -> slice:
 
 
 def _offsets(grid: SampleGrid) -> Float[Tensor, "s 2"]:
-    """Pixels of a window from its middle, row by row."""
+    """Return pixel offsets of a window from its middle, row by row."""
     d = torch.arange(SIDE, dtype=torch.float32, device=grid.device) - SIDE // 2
     return torch.stack([d.repeat(SIDE), d.repeat_interleave(SIDE)], -1)

@@ -12,7 +12,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 MIN_POINTS = 50, 25
-"""Fewest cells, and fewest features, that a pose is found from."""
+"""Fewest cells, and fewest features, for a pose."""
 
 
 def pnp(
@@ -21,7 +21,7 @@ def pnp(
     pixels: Float[Tensor, "p 2"],
     good: Bool[Tensor, "p"],
 ) -> Float[Tensor, "4 4"] | None:
-    """Pose T_ji of a view from cells with depth and their positions in it."""
+    """Estimate the pose T_ji of a view from cells with depth and their positions in it."""
     points = grid.rays[good] / inverse_depth[good, None]
     return _pnp(grid.camera, points, pixels[good], MIN_POINTS[0])
 
@@ -29,7 +29,7 @@ def pnp(
 def pnp_features(
     grid: SampleGrid, keyframe: Keyframe, matches: FeatureMatches
 ) -> Float[Tensor, "4 4"] | None:
-    """Pose T_ji of a view from features of a keyframe, which have the depth of their cells."""
+    """Estimate the pose T_ji of a view from features of a keyframe, with depths of their cells."""
     cell, inside = grid.cells_of(matches.first.to(grid.device))
     known = inside & (keyframe.information[cell] > 0)
     c, p = grid.camera, matches.first.to(grid.device)
@@ -41,7 +41,7 @@ def pnp_features(
 def _pnp(
     camera: Camera, points: Float[Tensor, "n 3"], pixels: Float[Tensor, "n 2"], least: int
 ) -> Float[Tensor, "4 4"] | None:
-    """Pose of a view from at least so many points and where it sees them (RANSAC, SQPnP)."""
+    """Estimate the pose of a view from at least ``least`` points and pixels (RANSAC, SQPnP)."""
     if len(points) < least:
         return None
     ok, rotation, translation, inliers = cv2.solvePnPRansac(

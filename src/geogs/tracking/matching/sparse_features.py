@@ -1,8 +1,8 @@
-"""Sparse features matched between two images of which nothing is known.
+"""Matching of sparse features between two images without any prior.
 
 Dense flow is a local search: from a cold start it finds motions up to some twenty pixels, and loses
-small things that move by more than their size. Features are compared each with all, so that their
-matches may be anywhere; those that obey one epipolar geometry give the dense flow a start.
+small objects that move by more than their size. Each feature is compared with all, so that matches
+may be anywhere; those that agree with one epipolar geometry give the dense flow a start.
 """
 
 from dataclasses import dataclass
@@ -22,16 +22,17 @@ from geogs.world.grid import SampleGrid
 FEATURES = 2000
 """Most features per image."""
 MIN_CONTRAST = 0.01
-"""Fraction of the range of grey levels: OpenCV's is 0.04, which leaves a road empty."""
+"""Contrast threshold as a fraction of the range of grey levels: OpenCV's default of 0.04 finds no
+features on a road."""
 MAX_RATIO = 0.85
-"""Largest distance to the most alike feature relative to that of the next."""
+"""Largest ratio of the distances to the most similar feature and the second."""
 EPIPOLAR_ERROR = 1.5
-"""Pixels from the epipolar line within which a match obeys it."""
+"""Largest distance of an inlier from its epipolar line, pixels."""
 MIN_DENSE = 0.4
-"""Fraction of matched cells below which features are tried; where a third of the cells find nothing
-but motions beyond the dense search, half of what it does find is wrong."""
+"""Matched fraction of cells below which features are tried; where a third of the cells move beyond
+the range of the dense search, half of its matches are wrong."""
 MIN_MATCHES = 40
-"""Fewest matches of one epipolar geometry that are believed; unlike images have about ten."""
+"""Fewest accepted matches of one epipolar geometry; images of different scenes have about ten."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class FeatureMatches:
 def match_features(
     first: Float[Tensor, "h w"], second: Float[Tensor, "h w"]
 ) -> FeatureMatches | None:
-    """SIFT features (Lowe 2004) of two images in grey levels that obey one epipolar geometry.
+    """Match SIFT features (Lowe 2004) of two grey images that agree with one epipolar geometry.
 
     Matches are mutual and pass the ratio test. None where there are too few.
     """
@@ -85,10 +86,10 @@ def guided_flow(
     there: FlowMatch,
     back: FlowMatch,
 ) -> tuple[FlowMatch, FlowMatch]:
-    """The given flow between two encoded images, or one that starts from their matched features.
+    """Return the given flow between two encoded images, or one that starts from their features.
 
-    That is measured where less than ``MIN_DENSE`` of the given one is matched, and taken unless it
-    matches not even half as much: a dense search that has lost its way agrees with itself, too.
+    The latter is measured if less than ``MIN_DENSE`` of the given flow is matched, and used if it
+    matches more than half as much: a failed dense search agrees with itself, too.
     """
     fraction = _matched(there)
     if fraction >= MIN_DENSE:
@@ -105,7 +106,7 @@ def guided_flow(
 def guided_flows(
     grid: SampleGrid, operator: FlowOperator, first: list[Any], second: list[Any]
 ) -> list[tuple[FlowMatch, FlowMatch]]:
-    """The same of pairs of images, from a cold start: from the first to the second, and back."""
+    """Measure guided flows of pairs of images from a cold start: first to second, and back."""
     matches = operator.measure(first, second, fine=False)
     found = []
     for n, pair in enumerate(zip(first, second, strict=True)):
@@ -117,7 +118,7 @@ def guided_flows(
 def spread_positions(
     grid: SampleGrid, points: Float[Tensor, "n 2"], moved: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "p 2"]:
-    """Where the cells of an image go if its points go to ``moved``: as those around them."""
+    """Interpolate the motion of points, which go to ``moved``, at the cells of an image."""
     cell, inside = grid.cells_of(points)
     cell, flow = cell[inside], (moved - points)[inside]
     total = torch.zeros(grid.size, 2).index_add_(0, cell, flow)
@@ -127,12 +128,12 @@ def spread_positions(
 
 
 def _matched(match: FlowMatch) -> float:
-    """Fraction of the cells of an edge that are matched."""
+    """Return the fraction of matched cells of an edge."""
     return float((match.weight[0, :, 0] > 0).float().mean())
 
 
 def _described(sift: cv2.SIFT, image: Float[Tensor, "h w"]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and descriptors of an image's features."""
+    """Detect an image's features; return their positions and descriptors."""
     grey = image.round().clamp(0, 255).byte().cpu().numpy()
     points, descriptors = sift.detectAndCompute(grey, None)
     pixels = np.array([p.pt for p in points], np.float32).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Relative pose of two views from their flow alone, and the depth that it gives."""
+"""Relative pose of two views from their flow alone, and the resulting depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,52 +19,52 @@ from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 MAX_BASELINES = 50.0
-"""Baselines beyond which a point says nothing on which of four poses is the right one."""
+"""Largest depth, in baselines, of a point that selects the right one of the four poses."""
 MAX_PAIRS = 5
-"""Pairs of views that are compared by what other views say of their depths."""
+"""Most pairs of views whose depths are compared by the other views."""
 MIN_LASTING = 2 / 3
-"""Fraction of the views that a cell is matched in which is followed longest."""
+"""Fraction of the views in which a cell is matched to count as tracked longest."""
 LASTING_FRACTION = 0.05, 0.8
-"""Fractions of the first matches that those followed longest may be, for the rest to be asked."""
+"""Smallest and largest fraction of the first matches tracked longest, for trying without them."""
 MIN_SUPPORT_RATIO = 1.2
-"""Times as much must the rest agree without them for them to move by themselves. In streets and
-rooms where nothing moves it was 1.00 to 1.06, with trucks that had bent the pose 1.4 to 2."""
+"""Least ratio of the others' support without and with them for them to count as moving objects. In
+static streets and rooms it was 1.00 to 1.06, with trucks that had biased the pose 1.4 to 2."""
 
 
 @dataclass(frozen=True)
 class TwoView:
-    """The relative pose of a pair of views and the depth that it gives, up to scale; on the CPU."""
+    """Relative pose of a pair of views and the resulting depth, up to scale; on the CPU."""
 
     T_ji: Float[Tensor, "4 4"]
     inverse_depth: Float[Tensor, "p"]
     """Inverse depth of the first view's cells, median 1; 1 where it is not good."""
     good: Bool[Tensor, "p"]
     parallax: float
-    """Median motion in pixels that rotation does not explain."""
+    """Median motion in pixels not explained by rotation."""
     apart: Bool[Tensor, "p"]
-    """Cells of the first view that move by themselves, by what the others say."""
+    """Cells of the first view on moving objects, judged by the others."""
 
 
 def best_two_view(
     camera: Camera, flows: Sequence[FlowMatch], min_parallax: float
 ) -> tuple[int, TwoView] | None:
-    """The pair to start from, of the flows from one view to others; None without parallax.
+    """Choose the best initial pair among flows from one view to others; None without parallax.
 
-    An essential matrix of a short baseline may be wrong and yet suit its pair well, so a few of
-    the pairs that have parallax over most good cells are compared: the depth that most cells
-    agree with in the other views, where they are matched, is right.
+    An essential matrix of a short baseline may be wrong and yet fit its pair well. So a few of the
+    pairs with parallax over most good cells are compared: the depth that most matched cells agree
+    with in the other views is right.
 
-    What is followed longest, such as a truck ahead, has most matches, and a camera that turns with
-    it explains it, far away, and nearly all the rest. So pairs without it are compared as well, and
-    taken where the rest agrees with them clearly more.
+    Cells tracked longest, such as a truck ahead, have most matches, and a camera that rotates with
+    the truck explains it as far away, and nearly all the rest. So pairs without these cells are
+    compared as well, and chosen where the rest agrees with them clearly more.
 
     Args:
         camera: of all views.
         flows: from the first view to each other, on the CPU.
-        min_parallax: motion that rotation does not explain, at least, pixels.
+        min_parallax: least motion not explained by rotation, pixels.
 
     Returns:
-        The index of the pair among the flows, and what it gives.
+        The index of the pair among the flows, and its result.
     """
     grid = SampleGrid(camera)
     best = _best_of(grid, flows, _with_parallax(camera, flows, min_parallax))
@@ -83,8 +83,8 @@ def best_two_view(
 
 
 def followed_longest(grid: SampleGrid, flows: Sequence[FlowMatch]) -> Bool[Tensor, "p"]:
-    """Cells of the first view, and those around, that are matched in most views; none where these
-    are hardly any, or most of what is matched at first."""
+    """Return cells of the first view, dilated by one, that are matched in most views; none if they
+    are very few, or most of the first matches."""
     sure = torch.stack([match.sure()[0] for match in flows])
     lasting = (sure.float().mean(0) >= MIN_LASTING).view(grid.height, grid.width)
     lasting = widened(lasting, 1).view(-1)
@@ -94,14 +94,14 @@ def followed_longest(grid: SampleGrid, flows: Sequence[FlowMatch]) -> Bool[Tenso
 
 
 def without(match: FlowMatch, cells: Bool[Tensor, "p"]) -> FlowMatch:
-    """A flow in which some cells are not matched."""
+    """Return a flow without the matches of some cells."""
     return replace(match, weight=match.weight * ~cells[:, None])
 
 
 def _with_parallax(
     camera: Camera, flows: Sequence[FlowMatch], min_parallax: float
 ) -> list[tuple[int, TwoView]]:
-    """The few pairs with parallax over most good cells, best first; numbered as their flows."""
+    """Return the few pairs with parallax over most good cells, best first, with flow indices."""
     found = thread_map(lambda match: two_view(camera, match), flows)
     able = [(n, v) for n, v in enumerate(found) if v is not None and v.parallax >= min_parallax]
     # Parallax helps until the views no longer overlap.
@@ -112,7 +112,7 @@ def _with_parallax(
 def _best_of(
     grid: SampleGrid, flows: Sequence[FlowMatch], found: Sequence[tuple[int, TwoView]]
 ) -> tuple[int, TwoView] | None:
-    """The pair that most cells agree with; none of none."""
+    """Return the pair that most cells agree with; None for none."""
     if len(found) < 2:
         return found[0] if found else None
     support = thread_map(lambda f: float(_support(grid, flows, *f).sum()), found)
@@ -122,8 +122,8 @@ def _best_of(
 def _support(
     grid: SampleGrid, flows: Sequence[FlowMatch], own: int, view: TwoView
 ) -> Float[Tensor, "p"]:
-    """How well each cell agrees with the depth of a pair of views, in the mean of the others that
-    it is matched in."""
+    """Return the mean agreement of each cell with the depth of a pair of views, over the other
+    views in which it is matched."""
     others = [match for n, match in enumerate(flows) if n != own]
     agreeing = torch.stack([agreement(grid, view, match) for match in others]).sum(0)
     matched = torch.stack([match.sure()[0] for match in others]).sum(0).clamp(min=1)
@@ -131,10 +131,10 @@ def _support(
 
 
 def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> Float[Tensor, "p"]:
-    """How well the cells of a flow agree with the depth of a pair of views, wherever it leads to:
-    1 down to 0, by Cauchy's weight of the residual in its own deviations.
+    """Return the agreement of a flow's cells with the depth of a pair of views, from 0 to 1: the
+    Cauchy weight of the residual in its own deviations.
 
-    The pose there is found from them (PnP). All on the CPU.
+    The pose of the flow's view is estimated from them (PnP). All on the CPU.
     """
     good = view.good & match.sure()[0]
     T = pnp(grid, view.inverse_depth, match.pixels[0], good)
@@ -146,7 +146,7 @@ def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> Float[Tensor
 
 
 def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
-    """Relative pose by the essential matrix and depth by triangulation, on the CPU."""
+    """Estimate relative pose by the essential matrix and depth by triangulation, on the CPU."""
     found = relative_pose(camera, match)
     if found is None:
         return None
@@ -170,9 +170,10 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
 def relative_pose(
     camera: Camera, match: FlowMatch
 ) -> tuple[Float64[np.ndarray, "4 4"], Int[np.ndarray, "n"]] | None:
-    """First camera to second by the essential matrix (MAGSAC), and the cells that agree with it.
+    """Estimate first camera to second by the essential matrix (MAGSAC), and its inlier cells.
 
-    The translation is a unit. None where too few cells are matched, or lie before both cameras.
+    The translation has length one. None where too few cells are matched, or are in front of both
+    cameras.
     """
     used = match.sure()[0].numpy()
     if used.sum() < 0.1 * len(used):
@@ -197,7 +198,7 @@ def relative_pose(
 def rays_through(
     pixels: Float64[np.ndarray, "n 2"], K: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Rays of z = 1 through the pixels of a camera with the matrix K."""
+    """Return rays with z = 1 through the pixels of a camera with the matrix K."""
     return np.c_[(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(pixels))]
 
 
@@ -206,9 +207,9 @@ def _pose_of(
     first: Float64[np.ndarray, "n 3"],
     second: Float64[np.ndarray, "n 3"],
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
-    """The one of the four poses of an essential matrix that sees most points before both cameras.
+    """Choose the pose of an essential matrix, of four, with most points in front of both cameras.
 
-    Returns the rotation, the unit translation (first camera to second) and which points lie there,
+    Returns the rotation, the unit translation (first camera to second) and which points are there,
     nearer than ``MAX_BASELINES``. From z R a + t = z' b for the rays a and b of a point its two
     depths follow by the cross products with b and with R a.
     """

@@ -1,8 +1,8 @@
-"""Rotation of the camera between two views, and whether it did more than rotate.
+"""Rotation of the camera between two views, and a test for translation.
 
-Two models explain a flow: the camera only rotated, or it moved as well. The second always fits
-better, having more freedom; which of them the flow speaks for is decided by Torr's geometric robust
-information criterion (GRIC, 1998), with the operator's own deviations.
+Two models explain a flow: the camera only rotated, or it also translated. The second always fits
+better, having more parameters; the choice is made by Torr's geometric robust information criterion
+(GRIC, 1998), with the operator's own deviations.
 """
 
 import math
@@ -20,22 +20,22 @@ from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 AGREEING = 0.4
-"""Fraction of the matched cells that must agree with a rotation for it to be believed."""
+"""Fraction of the matched cells that must agree with a rotation for it to be accepted."""
 SHARPENED = (0.1, 0.03, 0.01, 0.005, 0.005)
-"""Distances in the image, of the long edge, beyond which a cell counts little, step by step."""
+"""Scales of the robust loss, step by step, as fractions of the long edge."""
 TOLERANCE = 0.008
-"""Distance within which a cell agrees with a rotation, of the long edge."""
+"""Largest residual of a cell that agrees with a rotation, as a fraction of the long edge."""
 MOST_CELLS = 1024
-"""Most cells that are fitted, evenly spread ones of more."""
+"""Most cells that are fitted, evenly spread."""
 MIN_SIGMA = 0.1
-"""Pixels: no cell counts as more precise than this."""
+"""Least deviation of a cell, pixels."""
 LEAST_DEVIATION = 2e-4
-"""Radians: no rotation is known better, whatever its many cells say; they err alike."""
+"""Least deviation of a rotation, radians, as errors of its many cells are correlated."""
 
 
 @dataclass(frozen=True)
 class RotationFit:
-    """The rotation that most of a flow agrees with."""
+    """Rotation that most of a flow agrees with."""
 
     R: Float64[Tensor, "3 3"]
     """First camera to second."""
@@ -56,13 +56,13 @@ class TwoViewRotation:
     deviation: float
     """Standard deviation of the angle, radians."""
     is_pure: bool
-    """Whether nothing speaks for more than a rotation."""
+    """Whether the motion is explained by a rotation alone."""
 
 
 def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | None:
-    """The rotation between two views by the model that their flow (one edge) speaks for.
+    """Estimate the rotation between two views by the model that fits their flow (one edge) better.
 
-    None where too few cells agree with either. Those that are merely guessed do not count.
+    None where too few cells agree with either. Only confident cells count.
     """
     pair = match.on_cpu().only_sure()
     rotated = fit_rotation(grid, pair)
@@ -81,7 +81,7 @@ def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | N
 def has_moved(
     grid: SampleGrid, match: FlowMatch, rotated: RotationFit, T_ji: Float[Tensor, "4 4"]
 ) -> bool:
-    """Whether a flow (one edge, on the CPU) speaks for a relative pose, not for a rotation alone.
+    """Whether a flow (one edge, on the CPU) supports a relative pose rather than a rotation alone.
 
     ``rotated`` is the rotation that fits it best.
     """
@@ -90,13 +90,13 @@ def has_moved(
 
 
 def gric(squares: Float64[np.ndarray, "n"], dimension: int, parameters: int) -> float:
-    """Torr's criterion of a model of two views; the smaller, the better the model.
+    """Return Torr's criterion of a model of two views; the smaller, the better the model.
 
     Args:
         squares: squared errors of the matches in their variances.
-        dimension: of what a match may lie on, in the space of its four coordinates: 2 where the
-            model says where a point is seen, 3 where it says only on which line.
-        parameters: of the model.
+        dimension: of the manifold of matches in the space of four coordinates: 2 where the model
+            predicts a point, 3 where it only predicts a line.
+        parameters: number of the model's parameters.
     """
     n, codimension = len(squares), 4 - dimension
     robust = float(np.minimum(squares, 2 * codimension).sum())
@@ -104,10 +104,10 @@ def gric(squares: Float64[np.ndarray, "n"], dimension: int, parameters: int) -> 
 
 
 def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
-    """The rotation that most of a flow (one edge) agrees with.
+    """Fit the rotation that most of a flow (one edge) agrees with.
 
-    Gauss-Newton on the distances in the second image under Geman and McClure's loss, which is
-    sharpened from step to step. None where fewer than eight cells are matched.
+    Gauss-Newton on the distances in the second image under Geman and McClure's loss, whose scale
+    shrinks from step to step. None where fewer than eight cells are matched.
     """
     camera, used = grid.camera, (match.weight[0, :, 0] > 0).cpu().numpy()
     if used.sum() < 8:
@@ -128,7 +128,7 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
         def linearised(
             R: Float64[np.ndarray, "3 3"], reach: float = reach
         ) -> Float64[np.ndarray, "3"]:
-            """The gradient; the Hessian is kept, also for what is said of the deviation."""
+            """Return the gradient; keep the Hessian, also for the deviation."""
             nonlocal H
             error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
             square = (error**2).sum(1, keepdims=True) / (reach * edge) ** 2
@@ -154,11 +154,11 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
 def epipolar_squares(
     grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]
 ) -> Float64[np.ndarray, "n"]:
-    """Squared distances of the matched cells from their epipolar lines, in the flow's variances."""
+    """Return squared epipolar distances of the matched cells, in the flow's variances."""
     camera, used = grid.camera, match.weight[0, :, 0] > 0
     t, R = T_ji[:3, 3].double().numpy(), T_ji[:3, :3].double().numpy()
     rotated = grid.rays.cpu().double().numpy()[used.numpy()] @ R.T
-    normal = np.cross(t, rotated)  # of the plane of a ray and the baseline
+    normal = np.cross(t, rotated)  # of the epipolar plane
     line = normal[:, :2] / [camera.fx, camera.fy]
     pixels = match.pixels[0][used].double().numpy() - [camera.cx, camera.cy]
     off = (line * pixels).sum(1) + normal[:, 2]
@@ -174,7 +174,7 @@ def _linearised(
     focal: Float64[np.ndarray, "2"],
     centre: Float64[np.ndarray, "2"],
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 3"]]:
-    """Residuals of projections, and their derivatives by a rotation on the left."""
+    """Return residuals of projections, and their derivatives by a rotation on the left."""
     z = np.maximum(points[:, 2], 1e-3)
     x, y = points[:, 0] / z, points[:, 1] / z
     J = np.stack([
@@ -184,7 +184,7 @@ def _linearised(
 
 
 def _exponential(phi: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rodrigues' formula."""
+    """Return the rotation of a rotation vector (Rodrigues)."""
     angle = float(np.linalg.norm(phi))
     K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
     half = np.sinc(angle / (2 * np.pi))

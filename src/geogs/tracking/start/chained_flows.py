@@ -1,4 +1,4 @@
-"""Flow from the first of some keyframes to each of the others, chained from step to step."""
+"""Flow from the first of some keyframes to each of the others, chained step by step."""
 
 from itertools import pairwise
 
@@ -12,27 +12,26 @@ from geogs.types import FlowMatch
 from geogs.world.edges import Pair
 
 Positions = tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]
-"""Where the cells of one keyframe lie in another, and those of the other in it."""
+"""Positions of the cells of one keyframe in another, and of the other's cells in it."""
 
 
 class ChainedFlows:
-    """The flows of the keyframes of a graph that has no map yet.
+    """Flows between the keyframes of a graph that has no map yet.
 
-    While a start is tried again and again, most keyframes are those of the last attempt; what was
-    measured between them is kept.
+    Repeated attempts to start share most keyframes with the last one; their flows are kept.
     """
 
     def __init__(self, graph: FrameGraph) -> None:
         self.graph = graph
         self._steps: dict[Pair, Positions] = {}
         self._ids: list[int] = []
-        """The keyframes of the last attempt."""
+        """Keyframes of the last attempt."""
         self._flows: list[FlowMatch] = []
         self._reached: list[Positions] = []
-        """Unmatched cells filled in: from where the chain goes on."""
+        """Positions with unmatched cells filled in, from which the chain continues."""
 
     def measure(self) -> list[FlowMatch]:
-        """One edge from the first keyframe to each later one."""
+        """Measure one edge from the first keyframe to each later one."""
         ids = self.graph.keyframes.ids
         self._measure_steps(ids)
         same = next(
@@ -46,11 +45,11 @@ class ChainedFlows:
         return list(self._flows)
 
     def forget(self) -> None:
-        """Free what is kept, once there is a map."""
+        """Free all flows, once there is a map."""
         self._steps, self._ids, self._flows, self._reached = {}, [], [], []
 
     def _reach(self, ids: list[int], k: int) -> None:
-        """The flow to the k-th keyframe from that to the one before it."""
+        """Measure the flow to the k-th keyframe from that to the one before it."""
         grid, operator = self.graph.keyframes.grid, self.graph.operator
         step, back_step = self._steps[ids[k - 1], ids[k]]
         there, back = step, back_step
@@ -64,7 +63,7 @@ class ChainedFlows:
         self._reached.append((filled_positions(grid, match), filled_positions(grid, reverse)))
 
     def _measure_steps(self, ids: list[int]) -> None:
-        """The flow between keyframes that follow each other, in both directions."""
+        """Measure the flow between consecutive keyframes, in both directions."""
         keyframes, operator = self.graph.keyframes, self.graph.operator
         pairs = list(pairwise(ids))
         self._steps = {p: self._steps[p] for p in pairs if p in self._steps}

@@ -8,14 +8,14 @@ from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
 MAX_DISAGREEMENT = 0.05
-"""Radians by which a frame's orientation may differ from one between its keyframes."""
+"""Largest difference, in radians, of a frame's orientation from the interpolated one."""
 
 
 def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
-    """Give the frames of a start a pose between their keyframes.
+    """Interpolate poses of the frames of a start between their keyframes.
 
-    One whose rotations say another orientation has none: it was seen while the camera faced away
-    from both.
+    A frame whose relative rotations contradict its pose loses it: the camera then faced away from
+    both keyframes.
     """
     ordered = list(keyframes)
     indices = [k.frame_index for k in ordered]

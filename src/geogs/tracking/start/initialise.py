@@ -1,8 +1,8 @@
 """Start-up: poses and depths of the first keyframes from flow alone.
 
-Identity poses with unit depth fall into mirrored minima, so the pose of one keyframe against the
-first comes from the essential matrix, the others follow by PnP on flows chained from the first, and
-dense bundle adjustment with re-measured flow polishes the whole.
+Identity poses with unit depth would converge to mirrored minima. So the pose of one keyframe
+relative to the first comes from the essential matrix, the others follow by PnP on flows chained
+from the first, and dense bundle adjustment with re-measured flow refines all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -38,35 +38,35 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
 MIN_PARALLAX = 0.005
-"""Motion that rotation does not explain, needed to try to start, of the long edge."""
+"""Least motion not explained by rotation for a start, as a fraction of the long edge."""
 GIVEN_ERROR, MODEL_ERROR = 0.007, 0.01
-"""What focal length, lens and rows may be off by turns a rotation into parallax: deviation of a
-match that the camera's model leaves, of how far it has moved. The first of a lens that was given; a
-tenth of the deviation of a focal length is added, up to the second."""
+"""Deviation of a match due to errors of focal length, lens and rows, as a fraction of its motion;
+such errors turn a rotation into parallax. The first for a given lens; a tenth of the deviation of a
+focal length is added, up to the second."""
 MAX_DEVIATION, LAST_DEVIATION = 0.1, 0.2
-"""The map is started when the best known depths of its first keyframes are known to this: relative
-standard deviation by what matches and poses leave open. The second where nothing better will come
-of these keyframes: they are about to be given up for others, or the video ends."""
+"""Relative standard deviation of the best known depths of the first keyframes below which the map
+is started, by matches and poses. The second if these keyframes are about to be dropped for others,
+or the video ends."""
 LEAST_SEEN = 0.4
-"""Fraction of the first keyframe's depths that a keyframe must see to be placed on them."""
+"""Fraction of the first keyframe's depths that a keyframe must see for PnP on them."""
 ROUNDS, FORGIVING = 6, 2
-"""Rounds of flow and adjustment; and those after which it shows whether depths are far too open:
-later ones find them more open yet."""
+"""Rounds of flow and adjustment; and those after which depths are tested for far too large
+deviations, which grow in later rounds."""
 FAR = 1.5
-"""Times the allowed deviation of depths beyond which one more keyframe is not going to help."""
+"""Ratio to the allowed deviation of depths beyond which one more keyframe is not going to help."""
 MOST_MOVING = 0.5
-"""Fraction of all cells that may be held for moving: of more, the poses are those of what moves."""
+"""Largest fraction of cells marked as moving: with more, poses follow the moving objects."""
 
 
 class Attempt(Enum):
-    """What came of trying to start."""
+    """Outcome of an attempt to start."""
 
     STARTED = "started"
     FAILED = "failed"
     FAR_OFF = "far off"
-    """Depths are so open that only many more keyframes may help."""
+    """Depths are so uncertain that only many more keyframes may help."""
     APART = "apart"
-    """No one structure holds the keyframes together."""
+    """The keyframes are not all rigidly connected."""
 
 
 def initialise(
@@ -75,19 +75,19 @@ def initialise(
     flows: Sequence[FlowMatch],
     most_open: float,
 ) -> Attempt:
-    """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
+    """Estimate all keyframes of the graph from the flows from the first to the others alone.
 
-    It fails if they show no parallax, or none that a rotation of the camera would not explain as
-    well (:mod:`geogs.tracking.matching.two_view_rotation`), if matches and poses leave their depths
-    open (to more than ``most_open``), if most of what is seen moves by them (``MOST_MOVING``), if
-    no one structure holds all keyframes (:mod:`geogs.tracking.graph.rigid_parts`), or if the images
-    of two that follow each other do not correlate where poses and depths put them (``MIN_NCC``).
+    It fails if they show no parallax, or only what a rotation explains as well
+    (:mod:`geogs.tracking.matching.two_view_rotation`), if the deviation of depths is larger than
+    ``most_open``, if most cells move (``MOST_MOVING``), if not all keyframes are rigidly connected
+    (:mod:`geogs.tracking.graph.rigid_parts`), or if images of consecutive keyframes do not
+    correlate by their poses and depths (``MIN_NCC``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
     segment = graph.keyframes
     camera = segment.grid.camera
-    # Poses are guessed on the CPU.
+    # Initial poses are computed on the CPU.
     flows = [f.on_cpu() for f in flows]
     best = best_two_view(camera, flows, MIN_PARALLAX * camera.long_edge)
     deviation = segment.table.focal_deviation
@@ -104,7 +104,7 @@ def initialise(
 
 
 def polished(graph: FrameGraph, config: TrackingConfig, most_open: float) -> Attempt:
-    """Adjust keyframes whose poses and depths are known roughly, and say whether to start so."""
+    """Adjust keyframes with approximate poses and depths, and decide whether to start."""
     if not _polish(graph, config.moving, range(FORGIVING, ROUNDS)):
         return Attempt.FAILED
     segment, deviation = graph.keyframes, _depth_deviation(graph)
@@ -120,11 +120,11 @@ def polished(graph: FrameGraph, config: TrackingConfig, most_open: float) -> Att
 def has_moved_surely(
     grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"], focal_deviation: float
 ) -> bool:
-    """Whether a flow (one edge, on the CPU) speaks for a relative pose, not for a rotation alone,
-    with matches as unsure as the camera's model leaves them, of which the focal length is known to
-    a relative ``focal_deviation``; 0 where somebody said it.
+    """Whether a flow (one edge, on the CPU) supports a relative pose rather than a rotation alone.
 
-    Guesses have no say: of a bare wall they agree with either, and each speaks for the simpler one.
+    Deviations of matches include errors of the camera model; the focal length has a relative
+    ``focal_deviation``, 0 where it was given. Only confident cells count: guesses on a bare wall
+    agree with both, and each would support the simpler model.
     """
     sure, moved = match.only_sure(), (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
     error = min(GIVEN_ERROR + 0.1 * focal_deviation, MODEL_ERROR)
@@ -135,9 +135,9 @@ def has_moved_surely(
 
 
 def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, TwoView]) -> None:
-    """Poses by PnP on the first keyframe's depth, depths by propagating it; flows on the CPU.
+    """Set poses by PnP on the first keyframe's depth, and depths by propagating it; flows on CPU.
 
-    Keyframes that no longer see it are placed on what the one before them was given.
+    Keyframes that no longer see it are located by the depth of the one before.
     """
     segment = graph.keyframes
     chosen, view = best
@@ -145,7 +145,7 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
     first = keyframes[0]
     device, grid = segment.grid.device, SampleGrid(segment.grid.camera)
     for keyframe in keyframes:
-        keyframe.moving = None  # what a failed attempt held for moving was judged by wrong poses
+        keyframe.moving = None  # a failed attempt marked moving cells by wrong poses
     if view.apart.any():
         held = [view.apart, *(_carried(grid, view.apart, match) for match in flows)]
         for keyframe, cells in zip(keyframes, held, strict=True):
@@ -169,7 +169,7 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
 
 
 def _carried(grid: SampleGrid, cells: Bool[Tensor, "p"], match: FlowMatch) -> Bool[Tensor, "p"]:
-    """Where some cells of the first view, and those around, lie in another; all on the CPU."""
+    """Propagate some cells of the first view, dilated by one, to another view; all on the CPU."""
     there, inside = grid.cells_of(match.pixels[0, cells & match.sure()[0]])
     found = torch.zeros(grid.size, dtype=torch.bool)
     found[there[inside]] = True
@@ -177,7 +177,7 @@ def _carried(grid: SampleGrid, cells: Bool[Tensor, "p"], match: FlowMatch) -> Bo
 
 
 def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
-    """Pose of a keyframe by PnP on the depth of the one before it, or that one's pose."""
+    """Estimate a pose by PnP on the depth of the keyframe before, or return that one's pose."""
     grid, pair = graph.keyframes.grid, [before.encoded, keyframe.encoded]
     ((match, _),) = guided_flows(grid, graph.operator, pair[:1], pair[1:])
     good = match.sure()[0]
@@ -188,7 +188,7 @@ def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Flo
 
 
 def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
-    """Rounds of flow and adjustment, from forgiving to strict; then without what moves."""
+    """Run rounds of flow and adjustment, from tolerant to strict, then without moving cells."""
     segment, ids = graph.keyframes, graph.keyframes.ids
     near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + RADIUS]]
     for n in rounds:
@@ -203,8 +203,8 @@ def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
 
 
 def _depth_deviation(graph: FrameGraph) -> float:
-    """Relative deviation of the best known depths, the poses being as open as they are: the median
-    of the keyframes'."""
+    """Return the relative deviation of the best known depths, including errors of the poses: the
+    median over the keyframes."""
     ids = graph.keyframes.ids
     problem, _ = graph.problem(list(graph.edges), ids[1:], ids)
     found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=HUBER))
@@ -212,7 +212,7 @@ def _depth_deviation(graph: FrameGraph) -> float:
 
 
 def _passes_photometric_check(graph: FrameGraph) -> bool:
-    """Whether the images of all neighbours in time agree at their poses."""
+    """Whether all consecutive keyframes pass the photometric check."""
     keyframes, grey, found = graph.keyframes, graph.operator.grey, []
     pairs = list(pairwise(keyframes.ids))
     for (i, j), T_ji in zip(pairs, keyframes.relative_poses(pairs), strict=True):

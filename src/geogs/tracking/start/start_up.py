@@ -1,4 +1,4 @@
-"""Before there is a map: gather keyframes until one can be started from them."""
+"""Start-up: gather keyframes until a map can be started from them."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -30,31 +30,31 @@ from geogs.world.segments import TrackState
 
 MIN_KEYFRAMES = 4
 MIN_OVERLAP = 0.3
-"""While the map cannot be started: fraction of the first keyframe that the last has to see still
-for the first to be kept."""
+"""Fraction of the first keyframe that the last still has to see for the first to be kept, while the
+map cannot be started."""
 MAX_MISSES = 5
-"""Frames without a match after which a start that has not succeeded begins anew."""
+"""Frames without a match after which an unsuccessful start begins anew."""
 MORE = 0.25
-"""Fraction of the keyframes that are to come before a start is tried again that was far off."""
+"""Fraction of additional keyframes before a start that was far off is tried again."""
 
 
 class StartUp:
-    """Chooses keyframes by the flow since the last, and starts the map once there are enough."""
+    """Chooses keyframes by the flow since the last, and starts the map when there are enough."""
 
     def __init__(self, map: SegmentMap, choice: KeyframeChoice, config: TrackingConfig) -> None:
         self.map, self.config, self._choice = map, config, choice
         self.keyframes = map.keyframes
         self._grid = SampleGrid(map.keyframes.grid.camera)
-        """On the CPU, where rotations are measured."""
+        """Grid on the CPU, where rotations are measured."""
         self._flows = ChainedFlows(map.graph)
         self._progress = map.segment.start
         self._hardly_moved = False
-        """Whether the images moved too little for as many keyframes as a start takes."""
+        """Whether the images moved too little for the keyframes that a start needs."""
 
     def take(self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation] = ()) -> None:
-        """Take the next frame, of which rotations relative to others may be known already.
+        """Process the next frame, whose rotations relative to others may be known already.
 
-        The segment's state says whether the map has been started.
+        The segment's state shows whether the map has been started.
         """
         if frame.depth is not None and self._start_metric(frame, encoded, rotations):
             return
@@ -78,14 +78,14 @@ class StartUp:
         self.map.recorder.measure_rotation(measure)
 
     def finish(self) -> bool:
-        """Start with what there is; False if that cannot be."""
+        """Try to start with the present frames; return whether it succeeded."""
         self._hardly_moved = 0 < len(self.keyframes) < MIN_KEYFRAMES
         if self._hardly_moved:
             self._choose_among_all()
         return self._start(LAST_DEVIATION)
 
     def _start(self, most_open: float) -> bool:
-        """Start with what there is, if its depths are not more open than this."""
+        """Try to start with the present keyframes, with depth deviations up to ``most_open``."""
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
         flows = self._flows.measure()
@@ -103,7 +103,7 @@ class StartUp:
         return True
 
     def why_not(self) -> str:
-        """What to tell somebody whose video could not be started with."""
+        """Return a message for the user on why no map could be started."""
         if self._hardly_moved:
             return (
                 "The camera hardly moves (no parallax), so nothing can be reconstructed; "
@@ -126,20 +126,20 @@ class StartUp:
             self.map.restore(frames[n * last // (count - 1)], None, eye)
 
     def _start_with_part(self, most_open: float) -> Attempt:
-        """Start with those keyframes that one structure holds, which gives up the others."""
+        """Try to start with the largest rigidly connected part, dropping the other keyframes."""
         graph, keyframes = self.map.graph, self.keyframes
         part = largest_part(keyframes, graph.edges)
         if len(part) < MIN_KEYFRAMES:
             return Attempt.FAILED
         self.map.forget([k for k in keyframes.ids if k not in part])
         for keyframe in keyframes:
-            keyframe.moving = None  # it was held for moving by poses of the others
+            keyframe.moving = None  # judged with poses of the dropped keyframes
         return polished(graph, self.config, most_open)
 
     def _start_metric(
         self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
     ) -> bool:
-        """Start the map at once from what a depth sensor saw; False where that is too little."""
+        """Start the map at once from sensor depth; False where there is too little."""
         earlier = self.keyframes.ids
         keyframe = self.map.add(frame, encoded)
         if not self.map.sensor.start(keyframe, frame.depth, MIN_KNOWN):
@@ -158,7 +158,7 @@ class StartUp:
         rotations: Sequence[RelativeRotation],
         measure: Callable[[], RelativeRotation | None] | None = None,
     ) -> None:
-        """Add a keyframe to those the map will be started from, and start it with enough."""
+        """Add a keyframe for the start, and try to start when there are enough."""
         keyframe = self.map.add(frame, encoded)
         self._progress.flow.reset()
         self.map.complete(keyframe, rotations)
@@ -171,8 +171,8 @@ class StartUp:
             has_started = self._start(MAX_DEVIATION)
             if has_started or len(self.keyframes) < count:
                 return
-        # More keyframes may bring parallax. With twice as many every other one is left out; where
-        # the last no longer sees what the first saw, the first half is given up.
+        # More keyframes may bring parallax. With twice as many every other one is removed; where
+        # the last no longer overlaps with the first, the first half is dropped.
         if count < 2 * wanted:
             return
         overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
@@ -184,7 +184,7 @@ class StartUp:
             self._forget(self.keyframes.ids[: count // 2])
 
     def _miss(self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]) -> None:
-        """The view changed at once: wait for it to come back, start with what there is, or anew."""
+        """Handle a sudden change of view: wait for its return, try to start, or begin anew."""
         self._progress.misses += 1
         is_waiting = self._progress.misses < MAX_MISSES
         if not is_waiting:
@@ -210,6 +210,6 @@ class StartUp:
 
 
 def _rotation(earlier: int, grid: SampleGrid, match: FlowMatch) -> RelativeRotation | None:
-    """Rotation of a frame relative to an earlier one, by the flow from there; all on the CPU."""
+    """Estimate the rotation of a frame relative to an earlier one by the flow; all on the CPU."""
     found = two_view_rotation(grid, match)
     return None if found is None else RelativeRotation(earlier, found.R, found.deviation)

@@ -31,12 +31,12 @@ from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory
 
 PICTURES = ("lowres_wide", "vga_wide", "wide")
-"""Folders of images, at several sizes; the first is that which comes with every download."""
+"""Folders of images, at several sizes; the first comes with every download."""
 _NAME = re.compile(r"\d+_(\d+\.\d+)")
 _ASKED = 24
-"""Cameras that are read, about; that of each image differs a little by its focus."""
+"""Approximate number of cameras read; they differ a little by focus."""
 _MAX_GAP = 0.15
-"""Seconds between two poses across which one is interpolated: there are ten a second."""
+"""Longest gap between two poses for interpolation, in seconds: there are ten a second."""
 _TRUTHS = ("lowres_wide.traj", "lowres_poses.traj")
 
 
@@ -71,7 +71,7 @@ def open_posed_arkitscenes(place: Place) -> PosedSet:
 
 
 def is_arkitscenes_truth(path: Path) -> bool:
-    """Whether ``path`` is called as a file of poses."""
+    """Whether ``path`` has the name of a pose file."""
     return path.suffix == ".traj"
 
 
@@ -88,7 +88,7 @@ def read_arkitscenes_truth(path: Path) -> Trajectory:
 
 
 def _camera(place: Place, paths: list[Path]) -> Calibration | None:
-    """The median camera of images from all over the video; none where none is described."""
+    """The median camera of images spread over the video; none where no camera is described."""
     folder = place.folder / f"{place.pictures.name}_intrinsics"
     asked = (folder / f"{p.stem}.pincam" for p in paths[:: max(1, len(paths) // _ASKED)])
     cameras = [_read(file) for file in asked if file.is_file()]

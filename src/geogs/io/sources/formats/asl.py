@@ -34,7 +34,7 @@ PICTURES = tuple(f"mav0/cam{number}/data" for number in range(4))
 """Folders of images, those of the left camera first."""
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 _COLUMNS = (8, 17)
-"""Time, position, quaternion; EuRoC's has velocity and biases behind them."""
+"""Column counts: time, position, quaternion; EuRoC adds velocity and biases."""
 _NANOSECONDS = 1e-9
 
 
@@ -92,7 +92,7 @@ def _truth_of(path: Path, camera: Path) -> Trajectory:
 
 
 def _body_from_camera(camera: Path) -> Float64[np.ndarray, "4 4"]:
-    """The pose of a camera in the body; the body's own where nothing describes it."""
+    """The pose of a camera in the body frame; the identity where no file describes it."""
     found = _description(camera)
     if found is None:
         return np.eye(4)
@@ -112,7 +112,7 @@ def _body_from_camera(camera: Path) -> Float64[np.ndarray, "4 4"]:
 
 
 def _description(camera: Path) -> tuple[Path, dict[str, Any]] | None:
-    """The file that describes a camera, and what it says."""
+    """The file that describes a camera, and its content."""
     chain = camera.parent.parent / "dso" / "camchain.yaml"
     file = first_file((camera / "sensor.yaml", chain))
     if file is None:

@@ -1,8 +1,8 @@
 """COLMAP: a sparse model beside its images, also as ScanNet++ ships it for the iPhone.
 
 The layouts of cameras, images and points3D, as text or binary, are those of
-https://colmap.github.io/format.html. Two-dimensional keypoints are skipped: what is kept of them is
-which images see each point.
+https://colmap.github.io/format.html. Two-dimensional keypoints are skipped: only the
+images that see each point are kept.
 """
 
 import struct
@@ -39,7 +39,7 @@ _MODELS = (
 
 _TABLES = ("cameras", "images")
 LARGEST_TABLE = 1 << 34
-"""Bytes of a binary file."""
+"""Largest binary file in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ class SparseModel:
     cameras: dict[int, ModelCamera]
     images: dict[int, ModelImage]
     points: SparsePoints | None
-    """Seen by images that have their identifiers for indices."""
+    """Sparse points; they index images by identifier."""
 
 
 def is_model(folder: Path) -> bool:
@@ -97,7 +97,7 @@ def read_model(folder: Path) -> SparseModel:
         if path.is_file():
             points = _collected(_binary_points(path) if binary else _text_points(path))
     except (struct.error, ValueError, IndexError, ArithmeticError) as error:
-        said = str(error)  # by a parser of numbers: it would repeat what the file holds
+        said = str(error)  # a number parser's message would quote the file
         why = f" ({said})" if isinstance(error, _WrongModel) else ""
         raise InputError(
             f"{path} is cut off or no file of a COLMAP model{why}; copy it again."
@@ -155,7 +155,7 @@ def _text_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
 
 
 class _WrongModel(ValueError):
-    """An error in words of ours."""
+    """An error with a message of our own."""
 
 
 class _Bytes:
@@ -171,7 +171,7 @@ class _Bytes:
         return values
 
     def count(self) -> int:
-        """A number of records; refuses one that cannot be, before memory is asked for it."""
+        """Read a number of records; an impossible one is refused before memory is allocated."""
         (count,) = self.take("Q")
         if count > len(self._data):
             raise _WrongModel(f"{count} records")
@@ -231,7 +231,7 @@ def find_model(folder: Path) -> Path | None:
 def open_colmap(folder: Path, images: Path | None = None) -> PosedSet:
     """Read the model in a project folder (or given itself), images in natural order of names.
 
-    ``images`` is where they lie; without it, they are looked for around the model.
+    ``images`` is their folder; without it, they are searched for around the model.
     """
     place = find_model(folder)
     if place is None:

@@ -76,7 +76,7 @@ def decompose(
 
 
 def _cameras(folder: Path) -> Path:
-    """The file of the cameras; NeuS calls it otherwise."""
+    """The file of the cameras; NeuS uses another name."""
     sphere = folder / "cameras_sphere.npz"
     return sphere if sphere.is_file() else folder / "cameras.npz"
 
@@ -88,7 +88,7 @@ def _read_matrices(
     try:
         with open_file(path) as stream, np.load(stream) as archive:
             matrices = {name: archive[name].astype(np.float64) for name in archive.files}
-    except Exception as error:  # a damaged archive raises whatever zipfile, zlib or numpy find
+    except Exception as error:  # errors of zipfile, zlib or numpy for a damaged archive
         raise InputError(f"{path} is damaged or no NumPy archive; copy it again.") from error
     found = (re.fullmatch(r"world_mat_(0|[1-9][0-9]{0,8})", name) for name in matrices)
     numbers = sorted(int(match[1]) for match in found if match)

@@ -2,7 +2,7 @@
 
 The poses, ``*.gt.freiburg``, have TUM's rows with the number of the frame as time. Its cameras have
 a negative fy, -480: y points up, in the world as well, which makes the axes left-handed. With y
-turned down in both, the images are those of a camera with fy 480.
+flipped in both, the images are those of a camera with fy 480.
 https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html
 """
 
@@ -38,7 +38,7 @@ def is_associated(folder: Path) -> bool:
 
 
 def open_associated(folder: Path) -> ImageList:
-    """Read a sequence; frames that are counted are a thirtieth of a second apart."""
+    """Read a sequence; counted frames are 1/30 s apart."""
     listing = folder / LISTING
     files, fault = depths_there(listed(listing, _row, "a time and a file, twice"), listing)
     name = folder.resolve().name
@@ -62,7 +62,7 @@ def open_posed_associated(folder: Path) -> PosedSet:
 
 
 def is_icl_truth(path: Path) -> bool:
-    """Whether ``path`` is called as a file of poses."""
+    """Whether ``path`` has the name of a pose file."""
     return path.name.endswith(".gt.freiburg")
 
 
@@ -78,7 +78,7 @@ def _truth_beside(folder: Path) -> Path | None:
 
 
 def _is_counted(files: list[ImageFile]) -> bool:
-    """Whether the times are the numbers that the images are called by."""
+    """Whether the times are the numbers in the names of the images."""
     return all(f.path.stem == str(int(f.timestamp)) for f in files)
 
 

@@ -25,12 +25,12 @@ from geogs.io.sources.reader import RawFrame, RecordingInfo, median_rate
 from geogs.types import MeasuredPose
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
-"""Names that are taken for images."""
+"""Suffixes of image files."""
 
 # Where other tools put the images of a project.
 _SUBFOLDERS = ("images", "image", "rgb", "color", "frames", "data", "mav0/cam0/data")
 _ASKED = 24
-"""Images that are asked for their size, about, or pictures of depth whether they can be read."""
+"""Approximate number of images whose size is read, or of depth images that are tested."""
 _log = logging.getLogger(__name__)
 _SECONDS_BY_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
 
@@ -42,7 +42,7 @@ class ImageFile:
     path: Path
     timestamp: float
     depth: DepthFile | None = None
-    """Depth of a sensor at that time."""
+    """Sensor depth at that time."""
     pose: MeasuredPose | None = None
     """Pose by another tracker."""
 
@@ -52,13 +52,13 @@ class Place:
     """A sequence of a data set on disk."""
 
     folder: Path
-    """The sequence's own."""
+    """Folder of the sequence."""
     pictures: Path
-    """Folder of the images that are read; its own where the layout does not say."""
+    """Folder of the images; the sequence's where the layout names none."""
 
 
 class ImageList:
-    """Reader of image files; the size that most have is that of the recording."""
+    """Reader of image files; the most frequent size is that of the recording."""
 
     def __init__(
         self,
@@ -71,8 +71,8 @@ class ImageList:
         usual: ImageFile | None = None,
         depth_fault: str = "",
     ) -> None:
-        """What it says of itself is described in :class:`RecordingInfo`; ``usual`` is what
-        :func:`usual_file` gives, where that is known."""
+        """See :class:`RecordingInfo` for the description; ``usual`` is the result of
+        :func:`usual_file`, where that is known."""
         self.files = files
         depths = [file.depth for file in files if file.depth is not None]
         asked = depths[:: max(1, len(depths) // _ASKED)]
@@ -102,7 +102,7 @@ class ImageList:
         return [file.path for file in self.files]
 
     def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
-        """The images at these places."""
+        """Read the images at these indices."""
         for start in starts:
             yield from self.read(start, start + 1, 1)
 
@@ -135,9 +135,9 @@ def open_image_folder(folder: Path) -> ImageList:
 
 
 def depths_there(files: Sequence[ImageFile], listing: Path) -> tuple[list[ImageFile], str]:
-    """Images without the depths that a list names but are not there, and what is wrong if all are.
+    """Return the images without depths that are listed but missing, and the fault if all are.
 
-    Folders are asked once for all their files. The log says how many of several are missing.
+    Each folder is listed once. The log gives the number of missing files.
     """
     paths = [file.depth.path for file in files if file.depth is not None]
     folders = {path.parent for path in paths}
@@ -169,11 +169,11 @@ def listed(
     Args:
         listing: the file.
         read: an image of the list's folder and the words of a row. Raises ValueError.
-        expected: what a row has to hold, for the sentence.
-        between: what stands between words; white space if none.
+        expected: content of a row, for the error message.
+        between: separator of words; white space if none.
 
     Raises:
-        InputError: a row holds something else, or there is none.
+        InputError: a row holds something else, or there is no row.
     """
     files = []
     for number, line in enumerate(read_text(listing).splitlines(), start=1):
@@ -190,7 +190,7 @@ def listed(
 
 
 def finite(value: Any) -> float:
-    """A word or another value as a finite number. Raises ValueError or TypeError if it is none."""
+    """Return a value as a finite number. Raises ValueError or TypeError if it is none."""
     number = float(value)
     if not math.isfinite(number):
         raise ValueError
@@ -198,8 +198,8 @@ def finite(value: Any) -> float:
 
 
 def usual_file(files: Sequence[ImageFile]) -> ImageFile:
-    """The first of those images, from all over the list, that have the most frequent size; the
-    first of all if none can be read."""
+    """Return the first image of the most frequent size in a sample of the list; the first of all
+    if none can be read."""
     asked = files[:: max(1, len(files) // _ASKED)]
     sizes = [upright_size(file.path) for file in asked]
     counts = Counter(size for size in sizes if size is not None)
@@ -233,7 +233,7 @@ def in_order_of_time(paths: Sequence[Path]) -> list[ImageFile]:
 
 
 def time_from_name(stem: str) -> float | None:
-    """Seconds that a file name stands for; none where it is an ordinary name or number."""
+    """Time in seconds that a file name holds; none for an ordinary name or number."""
     if re.fullmatch(r"\d+\.\d+", stem):
         return float(stem)
     unit = _SECONDS_BY_DIGITS.get(len(stem)) if stem.isdecimal() else None
@@ -271,6 +271,6 @@ def _is_image(name: str) -> bool:
 
 
 def file_names(folder: Path) -> list[str]:
-    """Names of the files in a folder, which is asked once for all of them."""
-    with os.scandir(folder) as entries:  # of which only a link has to be asked what it leads to
+    """Names of the files in a folder, read in one pass."""
+    with os.scandir(folder) as entries:  # only links need another system call
         return [e.name for e in entries if (Path(e) if e.is_symlink() else e).is_file()]

@@ -57,8 +57,8 @@ def open_posed_kitti_odometry(place: Place) -> PosedSet:
 
 
 def is_kitti_truth(path: Path) -> bool:
-    """Whether ``path`` has poses of the odometry benchmark, and the times of their images lie in
-    the sequence of that name."""
+    """Whether ``path`` has poses of the odometry benchmark, and the sequence of that name has the
+    times of its images."""
     return path.suffix == ".txt" and _sequence_of(path) is not None
 
 
@@ -91,7 +91,7 @@ def _poses(file: Path, folder: Path) -> Trajectory:
 
 
 def timed(pictures: Path, times: np.ndarray | None, listing: Path) -> list[ImageFile]:
-    """Images with the time in the row of their number; ten a second where there are no times.
+    """Images with the time in the row of their number; ten per second without times.
 
     Raises:
         InputError: there are no numbered images, or more than times.
@@ -117,7 +117,7 @@ def _seconds(listing: Path) -> np.ndarray:
 
 
 def camera_of(path: Path, number: int, rectified: bool = True) -> Calibration:
-    """The camera ``number`` of a file of KITTI. Raises InputError where it is none."""
+    """Read camera ``number`` of a KITTI file. Raises InputError where it is no calibration."""
     try:
         return kitti_camera(path, number, rectified)
     except UNUSABLE:

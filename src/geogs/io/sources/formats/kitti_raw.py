@@ -27,9 +27,9 @@ from geogs.types import Trajectory
 RAW = tuple(f"image_{number:02d}/data" for number in (2, 0, 3, 1))
 """Folders of images, those of the left colour camera first."""
 _EARTH = 6378137.0
-"""Metres of its radius."""
+"""Radius of the Earth in metres."""
 _MAX_GAP = 0.25
-"""Seconds between two poses across which one is interpolated: there are ten a second."""
+"""Longest gap between two poses for interpolation, in seconds: there are ten a second."""
 
 
 def open_kitti_raw(place: Place) -> ImageList:
@@ -82,7 +82,7 @@ def _imu_trajectory(oxts: Path) -> Trajectory:
     T[:, 0, 3] = scale * longitude
     T[:, 1, 3] = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
     T[:, 2, 3] = altitude
-    T[:, :3, 3] -= T[:1, :3, 3]  # near the origin, where digits are left
+    T[:, :3, 3] -= T[:1, :3, 3]  # near the origin, to keep precision
     T[:, :3, :3] = Rotation.from_euler("xyz", rows[:, 3:]).as_matrix()  # roll, pitch, then yaw
     return matrix_trajectory(oxts, times, T, is_rigid(T))
 
@@ -139,7 +139,7 @@ def _dates(listing: Path) -> np.ndarray:
 
 
 def _raw_camera(path: Path, number: int, images: ImageList) -> Calibration:
-    """The rectified camera, or where the images have another size, as they have before, that."""
+    """The rectified camera; the unrectified one if the images have another size."""
     rectified = camera_of(path, number)
     size = (images.info.width, images.info.height)
     if (rectified.width, rectified.height) in (size, (None, None)):

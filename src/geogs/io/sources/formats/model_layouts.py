@@ -34,7 +34,7 @@ _MODELS = {
     "images/dslr_images_undistorted": "dslr_calibration_undistorted",
     "images/dslr_images": "dslr_calibration_jpg",
 }
-"""Folders of images, and where their model lies."""
+"""Folders of images, with the folder of their model."""
 SCANNETPP = tuple(name for name in _MODELS if name.startswith(("iphone", "dslr")))
 ETH3D = tuple(name for name in _MODELS if name.startswith("images"))
 _PHONE_CAMERA = "pose_intrinsic_imu.json"
@@ -43,7 +43,7 @@ _FRAME = re.compile(r"frame_(\d{1,9})\.\w+")
 
 
 def place_of_model(folder: Path) -> Place | None:
-    """The images that belong to a model; none where ``folder`` holds that of no such scene."""
+    """Images of the model in ``folder``; none where it is not the model of such a scene."""
     folder = folder.absolute()
     for pictures, model in _MODELS.items():
         parts = Path(model).parts

@@ -1,7 +1,7 @@
 """nerfstudio, instant-ngp and Blender: ``transforms.json`` with camera-to-world matrices.
 
-The cameras look along -z with y up (OpenGL). ``applied_transform`` and ``applied_scale`` say how
-the original world was changed; they are undone, so that results fit what the data set measured.
+The cameras look along -z with y up (OpenGL). ``applied_transform`` and ``applied_scale`` are
+the changes of the original world; they are undone, so that results fit the data set's truth.
 https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
@@ -53,7 +53,7 @@ def open_nerfstudio(path: Path) -> PosedSet:
 
 
 def with_transforms(images: ImageList, folder: Path) -> ImageList:
-    """Images with the poses that ``transforms.json`` beside them says, where there is one.
+    """Add the poses of ``transforms.json`` to the images beside it, where there is one.
 
     Raises:
         InputError: the file cannot be understood.
@@ -70,7 +70,7 @@ def with_transforms(images: ImageList, folder: Path) -> ImageList:
 
 
 def _finite(T: np.ndarray) -> np.ndarray:
-    """The matrix; one that can be inverted and is no pose where it cannot."""
+    """The matrix; if it cannot be inverted, an invertible one that is no pose."""
     is_usable = np.isfinite(T).all() and abs(np.linalg.det(T)) > 1e-9
     return T if is_usable else np.diag([2.0, 2.0, 2.0, 1.0])
 

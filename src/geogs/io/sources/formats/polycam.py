@@ -13,13 +13,13 @@ from geogs.io.sources.formats.image_files import ImageFile, ImageList, finite, n
 from geogs.io.sources.pose_priors import rigid_pose
 
 _DIGITS, _LEAST_GAP = 18, 1e-3
-"""Most digits of a time in microseconds, and least seconds from one keyframe to the next."""
+"""Most digits of a time in microseconds, and least median gap of keyframes in seconds."""
 _LENS = ("fx", "fy", "cx", "cy", "width", "height")
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Folders of cameras and images of an export of Polycam's raw data; none if it is no such."""
+    """Folders of cameras and images of a Polycam raw-data export; none if it is not one."""
     base = folder / "keyframes"
     for cameras, images in _FOLDERS:
         if (base / cameras).is_dir() and (base / images).is_dir():
@@ -30,7 +30,7 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
 def open_polycam(folder: Path) -> ImageList:
     """Read the keyframes of an export, whose names are their times in microseconds.
 
-    Where these cannot be, they are taken to be a thirtieth of a second apart.
+    Where they cannot be times, keyframes are assumed to be 1/30 s apart.
 
     Raises:
         InputError: there are none, or a camera cannot be understood.
@@ -67,7 +67,7 @@ def open_polycam(folder: Path) -> ImageList:
 
 
 def _times(names: list[str]) -> dict[str, float]:
-    """Seconds since the first of some keyframes, in order."""
+    """Time of each keyframe since the first, in seconds; names are in order."""
     evenly = {name: n / FRAMES_PER_SECOND for n, name in enumerate(names)}
     if not all(name.isdecimal() and len(name) <= _DIGITS for name in names):
         return evenly

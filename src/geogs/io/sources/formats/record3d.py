@@ -31,13 +31,13 @@ from geogs.types import MeasuredPose
 
 _NUMBER = re.compile(r"\d{1,18}")
 _LIDAR = (192, 256)
-"""Rows and columns of a depth whose size is not given."""
+"""Rows and columns of depth maps whose size is not given."""
 _LARGEST_DEPTH = 1 << 26
-"""Bytes of a compressed depth."""
+"""Largest compressed depth map in bytes."""
 
 
 def is_record3d(path: Path) -> bool:
-    """Whether ``path`` is an archive of Record3D or what was unpacked from one."""
+    """Whether ``path`` is a Record3D archive, or the folder of an unpacked one."""
     if path.is_dir():
         return (path / "metadata").is_file() and (path / "rgbd").is_dir()
     return path.suffix.lower() == ".r3d" and path.is_file() and zipfile.is_zipfile(path)
@@ -45,16 +45,16 @@ def is_record3d(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Files:
-    """Files by their names within a recording that was unpacked."""
+    """Files of an unpacked recording, by name."""
 
     path: Path
 
     def names(self) -> list[str]:
-        """Names of all, such as ``rgbd/0.jpg``."""
+        """Names of all files, such as ``rgbd/0.jpg``."""
         return [f"rgbd/{p.name}" for p in (self.path / "rgbd").iterdir()]
 
     def read(self, name: str, largest: int) -> bytes:
-        """Content of one. Raises InputError if it is missing, too large, or damaged."""
+        """Content of a file. Raises InputError if it is missing, too large, or damaged."""
         return read_bytes(self.path / name, largest)
 
 
@@ -84,17 +84,17 @@ _DAMAGED = (zipfile.BadZipFile, EOFError, ValueError)
 
 @dataclass(frozen=True)
 class Record3dDepth:
-    """The depth of a frame, unpacked when it is asked for."""
+    """The depth of a frame, unpacked on demand."""
 
     files: Files
     number: int
     size: tuple[int, int]
     """Rows and columns."""
     sensor: DepthCamera | None = None
-    """None: its pixels are those of the colour image, fewer."""
+    """None: the depth has the colour image's view, at a lower resolution."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
-        """The depth of its own pixels, 0 where it is unknown or hardly to be trusted."""
+        """The depth of its own pixels, 0 where it is unknown or of low confidence."""
         values = self._unpacked("depth", np.dtype(np.float32))
         if values is None:
             return None
@@ -109,7 +109,7 @@ class Record3dDepth:
         try:
             packed = self.files.read(f"rgbd/{self.number}.{kind}", _LARGEST_DEPTH)
             data = lzfse.decompress(packed)
-        except Exception:  # missing, or whatever a damaged one makes the decoder stumble over
+        except Exception:  # missing, or any error of the decoder
             return None
         values = np.frombuffer(data[: len(data) // dtype.itemsize * dtype.itemsize], dtype)
         rows, columns = self.size
@@ -126,7 +126,7 @@ class Record3dRecording:
         pictures = {Path(n).stem: n for n in names if n.endswith((".jpg", ".png"))}
         numbered = ((int(k), name) for k, name in pictures.items() if _NUMBER.fullmatch(k))
         self._images = dict(sorted(numbered))
-        """Names of the pictures by the number of the frame."""
+        """Names of the pictures by frame number."""
         if not self._images:
             raise InputError(f"{path} holds no images in rgbd/; export it again.")
         first = self._picture(next(iter(self._images)))
@@ -188,9 +188,9 @@ def _calibration(metadata: dict[str, Any], width: int, height: int) -> Calibrati
 
 
 def measured_poses(rows: object) -> dict[int, MeasuredPose]:
-    """Record3D's ``poses`` by the number of the frame; what is none is left out.
+    """Record3D's ``poses`` by frame number; invalid ones are left out.
 
-    Raises ValueError where they are no table of them.
+    Raises ValueError where they are no table of poses.
     """
     table = np.array(rows, dtype=np.float64)
     if not table.size:

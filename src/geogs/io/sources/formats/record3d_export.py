@@ -1,6 +1,6 @@
 """A recording that Record3D exported as pictures: ``metadata.json``, ``rgb`` and ``depth``.
 
-``metadata.json`` says what ``metadata`` of an ``.r3d`` does; pictures are numbered as its poses.
+``metadata.json`` has the content of an ``.r3d``'s ``metadata``; pictures are numbered as its poses.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ _KEYS = {"K", "poses", "w", "h"}
 
 
 def is_record3d_export(folder: Path) -> bool:
-    """Whether ``folder`` holds numbered pictures in ``rgb``, and what Record3D says of them."""
+    """Whether ``folder`` holds numbered pictures in ``rgb``, and Record3D's metadata."""
     if not ((folder / METADATA).is_file() and (folder / "rgb").is_dir()):
         return False
     try:
@@ -28,7 +28,7 @@ def is_record3d_export(folder: Path) -> bool:
 
 
 def open_record3d_export(folder: Path) -> ImageList:
-    """Read the pictures of an export, with their poses; depth in EXR is left.
+    """Read the pictures of an export, with their poses; EXR depth is not read.
 
     Raises:
         InputError: there is no picture, or the metadata cannot be understood.
@@ -58,6 +58,6 @@ def open_record3d_export(folder: Path) -> ImageList:
 
 
 def _name(folder: Path) -> str:
-    """Name of the recording, also where the folder is called as that of any export."""
+    """Name of the recording; the parent's where the folder has the default export name."""
     whole = folder.resolve()
     return whole.parent.name if whole.name.upper() == "EXR_RGBD" else whole.name

@@ -56,7 +56,7 @@ def _depth(image: Path, number: int, per_metre: float, there: Container[str]) ->
 
 
 def _units_per_metre(scene: Path) -> float:
-    """Scale of the depths in ``cam_params.json``, or else that of the data set."""
+    """Depth units per metre of ``cam_params.json``, or else of the data set."""
     file = _parameters(scene)
     document = None if file is None else read_json(file)
     camera = document.get("camera") if isinstance(document, dict) else None

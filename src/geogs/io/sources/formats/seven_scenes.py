@@ -28,7 +28,7 @@ _CAMERA = Calibration(
 )  # fmt: skip
 COLOUR_FROM_DEPTH = (-0.025, 0.0, 0.0)
 """Metres: X_colour = X_depth + this. Both cameras of the Kinect look the same way, side by side;
-the data set neither registers depth to colour nor publishes where they are."""
+the data set neither registers depth to colour nor publishes their positions."""
 _SENSOR = DepthCamera(Camera(585.0, 585.0, 320.0, 240.0, 640, 480), COLOUR_FROM_DEPTH)
 
 _log = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ def is_stray(folder: Path) -> bool:
 
 
 class StrayRecording(VideoFile):
-    """Reader of the video with the depth, of fewer pixels, and the pose that belong to each frame.
+    """Reader of the video with the low-resolution depth and the pose of each frame.
 
     Poses are ARKit's, camera to world, of the frames as they are stored.
     """
@@ -66,7 +66,7 @@ def _depth(folder: Path, path: Path, quarter_turns: int) -> DepthFile:
 
 
 def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:
-    """Poses by the number of the frame; rows that hold none are left out."""
+    """Poses by frame number; rows without a pose are left out."""
     header, *lines = read_text(path).splitlines() or [""]
     names = [name.strip() for name in header.split(",")]
     try:

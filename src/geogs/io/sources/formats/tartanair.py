@@ -36,7 +36,7 @@ def open_tartanair(place: Place) -> ImageList:
     if not pictures:
         raise InputError(f"{place.pictures} holds no images such as 000000_left.png.")
     files = [ImageFile(path, k / FRAMES_PER_SECOND) for k, path in pictures]
-    name = "-".join(place.folder.resolve().parts[1:][-3:])  # the place, the level, the path
+    name = "-".join(place.folder.resolve().parts[1:][-3:])  # scene, level, path
     images = ImageList("tartanair", name, files, None)
     width, height = images.info.width, images.info.height
     calibration = Calibration(
@@ -56,7 +56,7 @@ def open_posed_tartanair(place: Place) -> PosedSet:
 
 
 def is_tartanair_truth(path: Path) -> bool:
-    """Whether ``path`` is called as a file of poses."""
+    """Whether ``path`` has the name of a pose file."""
     return f"image_{path.stem.removeprefix('pose_')}" in PICTURES and path.suffix == ".txt"
 
 

@@ -1,4 +1,4 @@
-"""Images with the poses that were measured at times of their own."""
+"""Images with poses that were measured at other times."""
 
 import logging
 
@@ -11,9 +11,9 @@ from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 from geogs.types import Trajectory
 
 MAX_GAP = 0.1
-"""Seconds between two measured poses across which a pose is interpolated."""
+"""Longest gap between two measured poses for interpolation, in seconds."""
 MAX_BEYOND = 0.02
-"""Seconds by which an image may lie before the first or after the last measured pose."""
+"""Longest time of an image before the first or after the last measured pose, in seconds."""
 
 _log = logging.getLogger(__name__)
 
@@ -21,12 +21,12 @@ _log = logging.getLogger(__name__)
 def with_timed_poses(
     images: ImageList, trajectory: Trajectory, max_gap: float = MAX_GAP
 ) -> PosedSet:
-    """Images with their poses, in metres; those at whose time none was measured are left out.
+    """Images with their poses, in metres; images without a measured pose are left out.
 
     Args:
         images: with their times, seconds.
         trajectory: of the camera that took them, camera to world.
-        max_gap: seconds between two poses across which one is interpolated.
+        max_gap: longest gap between two poses for interpolation, in seconds.
 
     Raises:
         InputError: no image has a pose.
@@ -55,7 +55,7 @@ def with_timed_poses(
 def poses_at(
     trajectory: Trajectory, times: Float64[np.ndarray, "n"], max_gap: float
 ) -> tuple[Float64[np.ndarray, "n 4 4"], Bool[np.ndarray, "n"]]:
-    """Interpolate camera-to-world poses between the measured ones, and say where that is possible.
+    """Interpolate camera-to-world poses between the measured ones; a mask has where it is possible.
 
     Positions linearly, rotations on the sphere; nothing is extrapolated: the first and last pose
     hold for ``MAX_BEYOND`` seconds outwards.

@@ -1,7 +1,7 @@
 """TUM RGB-D: ``rgb.txt`` lists the colour images with their times, ``depth.txt`` the depths.
 
 ``groundtruth.txt`` holds the poses of the colour camera at their own times. Bonn's dynamic data set
-and ETH3D's SLAM sequences (with ``calibration.txt``) lie likewise.
+and ETH3D's SLAM sequences (with ``calibration.txt``) have the same layout.
 """
 
 from dataclasses import replace
@@ -40,9 +40,9 @@ _BONN = Calibration(
 )  # fmt: skip
 
 PER_METRE = 5000.0
-"""Units of a picture of depth to the metre."""
+"""Units of depth images per metre."""
 ASSOCIATED = 0.02
-"""Seconds between an image and a depth that belong together."""
+"""Largest time difference between an image and its depth, in seconds."""
 
 
 def is_tum(folder: Path) -> bool:
@@ -68,7 +68,7 @@ def known_camera(name: str) -> Calibration | None:
 
 
 def _with_depths(folder: Path, files: list[ImageFile]) -> tuple[list[ImageFile], str]:
-    """Images with the depth that is nearest in time, where one is near; why none has any."""
+    """Images with the depth nearest in time, where one is near; a reason if none has any."""
     listing = folder / "depth.txt"
     if not listing.is_file():
         return files, ""

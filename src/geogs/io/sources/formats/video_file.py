@@ -16,8 +16,8 @@ from geogs.documents import require_file
 from geogs.errors import InputError
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 
-# FFmpeg also "plays" text, pictures, devices, and play lists, which open what they name before
-# anybody sees what they are; none of them is a video file.
+# FFmpeg also "plays" text, pictures, devices, and play lists, which open the files they name
+# before they can be checked; none of them is a video file.
 _NOT_VIDEO = frozenset({
     "tty", "image2", "image2pipe", "hls", "concat", "concatf", "dash", "webm_dash_manifest", "sdp",
     "rtp", "rtsp", "sap", "imf", "vobsub", "lrc", "srt", "lavfi", "avisynth", "vapoursynth", "alsa",
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class VideoFile:
-    """Reader of one video; turned upright by the container's display matrix."""
+    """Reader of one video; frames are rotated upright by the container's display matrix."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -76,7 +76,7 @@ class VideoFile:
                     yield RawFrame(label, last or 0.0, None)
 
     def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
-        """The images from which these places can be decoded; fewer where a video cannot jump."""
+        """Read the images where decoding of these frames starts; fewer where it cannot seek."""
         with _open(self._path) as container:
             stream, before = container.streams.video[0], -1
             first = stream.start_time or 0
@@ -94,7 +94,7 @@ class VideoFile:
                 yield RawFrame(f"{self.info.name}, near frame {start}", frame.time or 0.0, image)
 
     def _time(self, frame: av.VideoFrame, last: float | None) -> float:
-        """The presentation time; raw streams and broken muxers have none that increases."""
+        """Presentation time, or an estimate where it is missing or does not increase."""
         if frame.time is not None and (last is None or frame.time > last):
             return frame.time
         return 0.0 if last is None else last + 1 / self.info.fps
@@ -117,7 +117,7 @@ def turn_upright(
 
 
 def _seconds(container: InputContainer) -> float | None:
-    """Time of the last image as the stream says it, or else the container."""
+    """Time of the last image by the stream, or else by the container."""
     stream = container.streams.video[0]
     if stream.duration is not None and stream.time_base is not None:
         return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
@@ -166,7 +166,7 @@ def _decoded(container: InputContainer, path: Path) -> Iterator[av.VideoFrame | 
             if frame is not None and frame.pts is not None:
                 shown = max(shown, frame.pts)
             yield None if frame is None or frame.is_corrupt else frame
-    # What threads still hold at the end comes in one call, which a damaged packet cuts short.
+    # Frames left in the threads come in one call at the end, which a damaged packet cuts short.
     if shown < latest and stream.codec_context.thread_count != 1:
         with _open(path) as again:
             again.streams.video[0].codec_context.thread_count = 1
@@ -174,7 +174,7 @@ def _decoded(container: InputContainer, path: Path) -> Iterator[av.VideoFrame | 
 
 
 def _packets(container: InputContainer, path: Path) -> Iterator["av.Packet[Any]"]:
-    """Packets to the end, the empty last one too, or to where the file is cut off."""
+    """Packets to the end, with the empty last one, or to the cut of a damaged file."""
     try:
         yield from container.demux(container.streams.video[0])
     except av.error.FFmpegError as error:

@@ -1,1 +1,1 @@
-"""Sources that do not wait: cameras, streams, pipes, and files that play at their pace."""
+"""Live sources: cameras, streams, pipes, and files played in real time."""

@@ -1,4 +1,4 @@
-"""Cameras of this machine through OpenCV, which asks their drivers and not its FFmpeg."""
+"""Cameras of this machine through OpenCV, by their drivers and not by its FFmpeg."""
 
 import time
 from collections.abc import Generator
@@ -10,7 +10,7 @@ from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 
 MOST_MISSED = 30
-"""Images in a row that do not come before a camera counts as gone."""
+"""Number of missed images in a row after which a camera counts as gone."""
 
 
 class Capture:
@@ -32,7 +32,7 @@ class Capture:
             capture.release()
 
     def frames(self) -> Generator[RawFrame, None, None]:
-        """Images from now on, with the seconds since the first at which they came."""
+        """Images from now on, with their time of arrival in seconds since the start."""
         capture, missed, number = self._open(), 0, 0
         began = time.monotonic()
         try:
@@ -57,5 +57,5 @@ class Capture:
             raise InputError(
                 f"{name} cannot be opened; is it plugged in, and used by nothing else?"
             )
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # no queue before ours, where the driver obeys
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # no queue before ours, if the driver supports it
         return capture

@@ -33,7 +33,7 @@ def open_live(address: LiveAddress, pipe: str, played: Reader | None = None) -> 
 
 
 class Played:
-    """The frames of another reader, none before its time has come: a rehearsal of a camera."""
+    """The frames of another reader in real time: a simulated camera."""
 
     def __init__(self, reader: Reader, name: str) -> None:
         self._reader = reader

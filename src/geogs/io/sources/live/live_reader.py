@@ -1,4 +1,4 @@
-"""A reader of live frames: it gives the newest, and counts those it dropped."""
+"""A reader of live frames: it yields the newest, and counts dropped ones."""
 
 import threading
 from collections.abc import Generator, Iterator, Sequence
@@ -19,7 +19,7 @@ class Feed(Protocol):
     info: RecordingInfo
 
     def frames(self) -> Generator[RawFrame, None, None]:
-        """Frames from now on; each is waited for."""
+        """Yield frames from now on; blocks until each arrives."""
         ...
 
 
@@ -56,8 +56,8 @@ def _selected(
 
 
 class Latest(Generic[T]):
-    """The newest of items that an iterator gives at its own pace: it is run in a thread, and what
-    is not taken in time is gone."""
+    """The newest item of an iterator, which runs in a thread; items not taken in time are
+    dropped."""
 
     def __init__(self, items: Iterator[T]) -> None:
         self._items = items
@@ -66,18 +66,18 @@ class Latest(Generic[T]):
         self._has_ended = self._is_closed = False
         self._failure: Exception | None = None
         self.dropped = 0
-        """Items that another took the place of before anybody wanted them."""
+        """Number of items replaced before they were taken."""
         self._thread = threading.Thread(target=self._work, name="grabber", daemon=True)
         self._thread.start()
 
     def take(self) -> T | None:
-        """The newest item that was not taken, waiting for one if need be; none after the last.
+        """Return the newest item not yet taken, or wait for one; none after the last.
 
-        Raises what the iterator raised, once all it gave is taken.
+        Raises the iterator's exception, once its items are taken.
         """
         with self._news:
             while not (self._held or self._has_ended):
-                self._news.wait(0.2)  # so that signals are heard
+                self._news.wait(0.2)  # so that signals are handled
             if self._held:
                 return self._held.pop()
             if self._failure is not None:
@@ -85,7 +85,7 @@ class Latest(Generic[T]):
             return None
 
     def close(self, patience: float = 2.0) -> None:
-        """Take no more; waits so many seconds at most for the iterator to end."""
+        """Stop; wait at most ``patience`` seconds for the iterator to end."""
         self._is_closed = True
         self._thread.join(patience)
 

@@ -12,7 +12,7 @@ from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 
 PATIENCE = 10.0
-"""Seconds without an answer after which a stream counts as gone."""
+"""Timeout in seconds after which a stream counts as gone."""
 _OPTIONS = {
     "rtsp_transport": "tcp",
     # No stream may lead to a file of this machine.
@@ -36,7 +36,7 @@ class NetworkStream:
             self.info = RecordingInfo(address.kind, address.name, first.width, first.height, fps)
 
     def frames(self) -> Generator[RawFrame, None, None]:
-        """Images from now on, with the seconds since the first at which they came."""
+        """Images from now on, with their time of arrival in seconds since the start."""
         with self._open() as container:
             began = time.monotonic()
             for number, frame in enumerate(_frames(container)):
@@ -57,7 +57,7 @@ class NetworkStream:
 
 
 def _frames(container: InputContainer) -> Generator[av.VideoFrame, None, None]:
-    """Images until the stream ends or is gone; what is damaged is left out."""
+    """Images until the stream ends or is gone; damaged ones are left out."""
     with suppress(av.error.FFmpegError, OSError):
         for packet in container.demux(container.streams.video[0]):
             with suppress(av.error.FFmpegError):

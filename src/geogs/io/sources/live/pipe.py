@@ -1,7 +1,7 @@
-"""Raw frames from a pipe: YUV4MPEG2, which says its own format, or bare pixels as given.
+"""Raw frames from a pipe: YUV4MPEG2, which describes its format, or bare pixels of a given one.
 
 YUV4MPEG2 is a line of header (``YUV4MPEG2 W640 H480 F30:1 C420``), then ``FRAME`` and the planes Y,
-Cb and Cr, again and again. Source: the manual page yuv4mpeg(5) of mjpegtools.
+Cb and Cr for each frame. Source: the manual page yuv4mpeg(5) of mjpegtools.
 """
 
 import re
@@ -39,9 +39,9 @@ class RawFormat:
     pixels: str
     """rgb24, bgr24, gray, yuv420p or yuv444p."""
     fps: float | None
-    """Frames per second; none where nobody said, and frames are timed as they come."""
+    """Frames per second; none where it is not given, and frames are timed on arrival."""
     has_frame_lines: bool = False
-    """Whether a line stands before each frame."""
+    """Whether a line precedes each frame."""
     is_full_range: bool = False
     """Whether Y goes from 0 to 255 rather than from 16 to 235, and Cb and Cr likewise."""
 
@@ -112,7 +112,7 @@ class Pipe:
         self._began: float | None = None
 
     def frames(self) -> Generator[RawFrame, None, None]:
-        """Frames from where the pipe is, until it ends; a last one that is cut off is left out."""
+        """Frames from the pipe's current position to its end, without an incomplete last one."""
         form = self._format
         while True:
             if form.has_frame_lines and not self._stream.readline(_LONGEST_LINE).startswith(

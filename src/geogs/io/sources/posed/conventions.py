@@ -1,6 +1,6 @@
-"""The usual mistakes in giving poses, and how to set each right.
+"""Common mistakes in pose conventions, and the correction of each.
 
-Mistakes that change nothing in the images, such as a turned world, are none here.
+Mistakes that change nothing in the images, such as a rotated world, are not included.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ Poses = Float64[np.ndarray, "n 4 4"]
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """A way in which poses are given wrongly."""
+    """A wrong convention of given poses."""
 
     name: str
     """Description of such poses."""
     remedy: str
     """Correction by the user."""
     correct: Callable[[Poses], Poses]
-    """Right world-to-camera poses, up to the world, from those that were read."""
+    """Map poses as read to correct world-to-camera poses, up to a change of the world."""
 
 
 def conventions_for(kind: str) -> tuple[Convention, ...]:
@@ -62,8 +62,8 @@ _IN_OPENCV = (
     Convention(_INVERSE, _INVERT, np.linalg.inv),
     Convention(f"{_INVERSE} in OpenGL axes", _INVERT_AND_NEGATE, _inverse_and_opengl),
 )
-# The reader has turned the cameras from OpenGL to OpenCV axes already. With inverse poses that
-# turned the world instead, so that whether the cameras still have to be turned is the other way.
+# The reader has converted the cameras from OpenGL to OpenCV axes already. With inverse poses that
+# rotated the world instead, so the conversion of the cameras is needed in the opposite case.
 _IN_OPENGL = (
     Convention("cameras in OpenCV axes (y down, looking along +z)", _NEGATE, _OPENGL),
     Convention(f"{_INVERSE} in OpenCV axes", _INVERT_AND_NEGATE, np.linalg.inv),

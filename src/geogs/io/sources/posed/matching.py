@@ -11,15 +11,15 @@ from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.undistort import resized_to
 
 LONG_EDGE = 640
-"""Images are matched at this size at most."""
+"""Largest long edge for matching, in pixels."""
 FEATURES = 800
 """Most features of an image."""
 MIN_MATCHES = 25
-"""Fewest matches of a pair that counts."""
+"""Fewest matches of a usable pair."""
 MIN_MOTION = 0.03
-"""Median motion wanted between the images of a pair, of the long edge."""
+"""Least median motion between the images of a pair, relative to the long edge."""
 MAX_MOTION = 0.15
-"""Motion beyond which the next pair is looked for at a smaller distance."""
+"""Median motion beyond which the next pair is searched at a smaller frame distance."""
 
 _RATIO = 0.8
 _EPIPOLAR_PIXELS = 1.5
@@ -28,7 +28,7 @@ _OFFSETS = (1, 2, 5, 10, 20, 40)
 
 @dataclass(frozen=True, slots=True)
 class MatchedPair:
-    """Pixels of ``camera`` at which images ``first`` and ``second`` show the same thing."""
+    """Corresponding pixels of images ``first`` and ``second``, in the matcher's ``camera``."""
 
     first: int
     second: int
@@ -44,8 +44,8 @@ class Matcher:
         camera = source.camera
         is_large = camera.long_edge > LONG_EDGE
         self.camera: Camera = camera.with_long_edge(LONG_EDGE) if is_large else camera
-        """The camera whose pixels the matches are in."""
-        # Without the precise enlargement features lie a quarter of a pixel too far right and down.
+        """Camera of the matched pixels."""
+        # Without precise upscaling, features are shifted by a quarter of a pixel right and down.
         self._sift = cv2.SIFT.create(nfeatures=FEATURES, enable_precise_upscale=True)
         self._features: dict[int, tuple[Float64[np.ndarray, "n 2"], np.ndarray]] = {}
         self._offset = 0
@@ -58,9 +58,9 @@ class Matcher:
         return [pair for pair in pairs if pair is not None]
 
     def _pair(self, first: int) -> MatchedPair | None:
-        """A pair with enough motion: images further and further on, then those turned little.
+        """Find a pair with enough motion: at increasing frame distance, then by least rotation.
 
-        How far the later image should be is remembered, for the next pair will be alike.
+        The frame distance is kept, for the next pair will be similar.
         """
         best: MatchedPair | None = None
         for k in range(self._offset, len(_OFFSETS)):
@@ -101,7 +101,7 @@ class Matcher:
             return None
         nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one_descriptors, two_descriptors, k=2)
         good = [a for a, b in nearest if a.distance < _RATIO * b.distance]
-        # A feature that several others claim is none.
+        # Of several matches to one feature only the first is kept.
         _, index = np.unique([match.trainIdx for match in good], return_index=True)
         if len(index) < MIN_MATCHES:
             return None

@@ -1,4 +1,4 @@
-"""All images of a set as one pinhole camera sees them, though several cameras took them."""
+"""Images of several cameras, resampled to one common pinhole camera."""
 
 import logging
 from collections import Counter
@@ -22,17 +22,17 @@ from geogs.io.sources.undistort import Rectifier, mask_as_image, resized_to
 _log = logging.getLogger(__name__)
 
 SAME_CAMERA = 0.02
-"""Pixels of the working image by which two cameras may differ and still count as one."""
+"""Largest difference of two cameras that count as one, in pixels of the working image."""
 MAX_ZOOM = 1.5
 """Largest enlargement of an image that has fewer pixels per degree than the common camera."""
 MIN_SHARED = 0.6
-"""Least part that the fields of view of two cameras must share of the larger one."""
+"""Least overlap of the fields of view of two cameras, as a fraction of the larger one."""
 MAX_KEPT_MAPS = 8
-"""Most different cameras whose resampling is remembered; with more it is worked out each time."""
+"""Largest number of cameras for which resampling maps are cached; with more, none are."""
 
 
 class OneCamera:
-    """The common camera, that of most images, and the way of each image into it."""
+    """The common camera, that of most images, and the resampling of each image to it."""
 
     def __init__(self, files: Sequence[PosedFile], config: InputConfig) -> None:
         self._files = files
@@ -48,7 +48,7 @@ class OneCamera:
         self.camera: Camera = rectifier.camera
         """The pinhole camera of every image."""
         self.origin = first.origin
-        """Where its intrinsics come from."""
+        """Origin of its intrinsics."""
         keeps_maps = len(cameras) <= MAX_KEPT_MAPS
         ways = {
             key: rectifier
@@ -59,12 +59,12 @@ class OneCamera:
         self._ways = [ways[key] for key in keys]
 
     def unlike(self) -> list[int]:
-        """Places of the images whose cameras differ too much for the common one to stand in."""
+        """Indices of the images whose cameras differ too much from the common one."""
         ways = enumerate(self._ways)
         return [k for k, way in ways if isinstance(way, Resampler) and way.is_unlike]
 
     def check(self) -> None:
-        """Raises InputError where cameras differ too much; warns where images are cropped."""
+        """Raise InputError where cameras differ too much; warn where images are cropped."""
         cropped = 0
         for file, way in zip(self._files, self._ways, strict=True):
             if isinstance(way, Rectifier):
@@ -84,7 +84,7 @@ class OneCamera:
             )  # fmt: skip
 
     def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
-        """Image ``index`` and its mask as the common camera sees them; none where all is valid.
+        """Read image ``index`` in the common camera, and its mask, or none where all is valid.
 
         Raises:
             InputError: it cannot be read.
@@ -102,7 +102,7 @@ class OneCamera:
 
 
 class Resampler:
-    """Makes the image of ``target`` from that of another camera at the same place.
+    """Makes the image of ``target`` from that of another camera at the same pose.
 
     Both look along the same axes, so that pixels map by K_source D(K_target^-1 u) with the
     source's distortion D, whatever the scene.
@@ -111,14 +111,14 @@ class Resampler:
     def __init__(
         self, source: Calibration, target: Camera, zoom: float, keeps_maps: bool = False
     ) -> None:
-        """With ``keeps_maps`` where each pixel comes from is worked out once; 8 bytes a pixel."""
+        """With ``keeps_maps`` the resampling maps are cached, at 8 bytes a pixel."""
         camera = source.camera()
         self.shared = _shared_view(camera, target)
-        """Part of the larger field of view that both have."""
+        """Overlap as a fraction of the larger field of view."""
         self.is_unlike = target.fx / camera.fx > MAX_ZOOM or self.shared < MIN_SHARED
-        """Whether the cameras differ too much for the target to stand in."""
+        """Whether the cameras differ too much for resampling."""
         self.description = f"{camera.width}x{camera.height}, focal length {camera.fx:.0f}"
-        # The source comes to about the target's scale first, so that no detail is skipped.
+        # The source is first resized to about the target's scale, to avoid aliasing.
         scale = min(1.0, target.fx / zoom / camera.fx)
         size = (round(camera.width * scale), round(camera.height * scale))
         resized = camera.resized(max(size[0], 1), max(size[1], 1))
@@ -153,14 +153,14 @@ class Resampler:
 
 
 def common_place(keys: Sequence[Hashable]) -> int:
-    """Place of the first image of the camera that took most; of several the first one."""
+    """Index of the first image of the most frequent camera; on a tie, of the earlier one."""
     return keys.index(Counter(keys).most_common(1)[0][0])
 
 
 def _way(
     camera: Calibration, target: Camera, zoom: float, keeps_maps: bool
 ) -> Resampler | Rectifier:
-    """The way of a camera into the target; without resampling where they are the same anyway."""
+    """Resampling of a camera to the target; a plain rectifier where they are the same."""
     if not camera.is_distorted:
         rectifier = Rectifier(camera, target.long_edge)
         own = rectifier.camera
@@ -178,7 +178,7 @@ def _corners(camera: Camera, target: Camera) -> Float64[np.ndarray, "2 2"]:
 
 
 def _shared_view(one: Camera, other: Camera) -> float:
-    """Area that two images share on the plane z = 1, as part of the larger image."""
+    """Overlap of two images on the plane z = 1, as a fraction of the larger area."""
     (low, high), (other_low, other_high) = _view(one), _view(other)
     shared = np.minimum(high, other_high) - np.maximum(low, other_low)
     area = max(np.prod(high - low), np.prod(other_high - other_low))

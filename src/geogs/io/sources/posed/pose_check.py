@@ -1,4 +1,4 @@
-"""Check that poses fit the images, or name the axis convention in which they do."""
+"""Check that poses fit the images, or find the axis convention in which they do."""
 
 import logging
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from geogs.io.sources.posed.matching import MatchedPair, Matcher
 from geogs.io.sources.posed.posed_source import PosedSource
 
 PAIRS = 8
-"""Pairs of images looked at."""
+"""Number of image pairs used."""
 GOOD_ERROR = 0.004
-"""Median epipolar error of poses that fit, at most, of the long edge."""
+"""Largest median epipolar error of poses that fit, relative to the long edge."""
 GOOD_IN_FRONT = 0.75
-"""Part of the matches that lies in front of both cameras if the poses fit, at least."""
+"""Least fraction of matches in front of both cameras if the poses fit."""
 CLEARLY = 3.0
 """Least ratio of the error of wrong poses to that of the convention that fits."""
 
@@ -29,9 +29,9 @@ class Fit:
     """Agreement of poses with matches between images."""
 
     error: float
-    """Median Sampson distance to the epipolar line, as a part of the long edge."""
+    """Median Sampson distance to the epipolar line, relative to the long edge."""
     in_front: float
-    """Part of the matches whose rays meet in front of both cameras."""
+    """Fraction of matches whose rays meet in front of both cameras."""
 
     @property
     def is_good(self) -> bool:
@@ -40,7 +40,7 @@ class Fit:
 
     @property
     def badness(self) -> float:
-        """One number to compare conventions by: the error, more where points lie behind."""
+        """Score to compare conventions: the error, increased where points lie behind."""
         return max(self.error, 1e-4) / max(self.in_front, 0.05) ** 2
 
 
@@ -51,15 +51,15 @@ class PoseCheck:
     given: Fit | None
     """Fit of the poses as they are; none where no images could be matched."""
     pairs: int
-    """Pairs of images that could be matched."""
+    """Number of matched image pairs."""
     warning: str | None
     """Warning for the user; none where the poses fit."""
 
 
 def check_poses(source: PosedSource) -> PoseCheck:
-    """Match features between neighbouring images and see whether the poses explain them.
+    """Match features between neighbouring images and check whether the poses explain them.
 
-    Neither the scale nor the place of the world matters. Takes about two seconds.
+    Neither the scale nor the frame of the world matters. Takes about two seconds.
 
     Raises:
         InputError: the poses clearly do not fit, but do in another axis convention.
@@ -76,7 +76,7 @@ def check_poses(source: PosedSource) -> PoseCheck:
 
 
 def judge(source: PosedSource, pairs: list[MatchedPair], camera: Camera) -> PoseCheck:
-    """See whether the poses of ``source`` explain matches in pixels of ``camera``.
+    """Check whether the poses of ``source`` explain matches in pixels of ``camera``.
 
     Raises:
         InputError: as :func:`check_poses`.

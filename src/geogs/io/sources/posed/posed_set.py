@@ -23,16 +23,16 @@ class PosedFile:
     T_cw: Float64[np.ndarray, "4 4"]
     """World to camera, OpenCV axes."""
     calibration: Calibration | None = None
-    """The camera that took it; none where the format does not say."""
+    """Its camera; none where the format does not give it."""
     mask: Path | None = None
-    """Image whose bright pixels are to be used; may be ``path`` itself, then its alpha."""
+    """Mask image, bright where valid; may be ``path`` itself, then its alpha."""
     timestamp: float = 0.0
     """Seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class SparsePoints:
-    """Triangulated points and which images see them."""
+    """Triangulated points and the images that see them."""
 
     positions: Float64[np.ndarray, "n 3"]
     """In the world."""
@@ -42,7 +42,7 @@ class SparsePoints:
     """Image of observation k: its index in the source."""
 
     def for_images(self, kept: Sequence[int]) -> "SparsePoints":
-        """The points that the images ``kept`` see, these being numbered 0, 1, ... now."""
+        """The points seen by the images ``kept``, which are renumbered 0, 1, ..."""
         new_image = renumbered(self.seen_image, kept)
         stays = new_image >= 0
         points, seen_point = np.unique(self.seen_point[stays], return_inverse=True)
@@ -50,7 +50,7 @@ class SparsePoints:
 
 
 def renumbered(numbers: Int64[np.ndarray, "m"], kept: Sequence[int]) -> Int64[np.ndarray, "m"]:
-    """The place of each number in ``kept``, whose entries are different; -1 where it is not."""
+    """Index of each number in ``kept``, whose entries are distinct; -1 where it is missing."""
     order = np.argsort(kept, kind="stable")
     ascending = np.asarray(kept, dtype=np.int64)[order]
     place = np.searchsorted(ascending, numbers).clip(max=len(ascending) - 1)
@@ -114,7 +114,7 @@ def _refuse(posed: PosedSet, rotation: Float64[np.ndarray, "n 3 3"]) -> None:
 
 
 def _rigid(T: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """The pose with the nearest rotation; itself where its rotation is exact to 1e-9 already."""
+    """The pose with the nearest rotation; unchanged if its rotation is exact to 1e-9."""
     rotation = T[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9:
         return T

@@ -21,10 +21,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class PosedImage:
-    """One working image and where it was taken."""
+    """One working image with its pose."""
 
     index: int
-    """Its place in the source, from 0."""
+    """Its index in the source, from 0."""
     label: str
     """Its name in messages: the file."""
     timestamp: float
@@ -34,21 +34,21 @@ class PosedImage:
     T_cw: Float64[np.ndarray, "4 4"]
     """World to camera, OpenCV axes."""
     mask: Bool[np.ndarray, "h w"] | None
-    """Pixels to use; none where all are."""
+    """Pixels to use; none where all are valid."""
 
 
 class PosedSource:
-    """Images with known poses, all as one pinhole camera sees them; read when asked for.
+    """Images with known poses, all in one pinhole camera; read on demand.
 
     ``len(source)``, ``source[i]`` and iteration (which reads ahead) give :class:`PosedImage`.
     """
 
     def __init__(self, posed: PosedSet, config: InputConfig, hold_out: int | None = None) -> None:
-        """Every ``hold_out``-th of the selected images is left out as if it were not there."""
+        """Every ``hold_out``-th of the selected images is left out."""
         posed = _selected(without_invalid_poses(_present(posed)), config)
         left_out = held_out_places(len(posed.files), hold_out)
         self.held_out: list[int] = [config.start + config.stride * i for i in left_out]
-        """Images left out: their places in the source with neither start nor stride, from 0."""
+        """Indices of the images left out, in the source with neither start nor stride, from 0."""
         if left_out:
             posed = posed.only(sorted(set(range(len(posed.files))) - set(left_out)))
         self._files = posed.files
@@ -59,7 +59,7 @@ class PosedSource:
         self.scene_scale = posed.scene_scale
         """Unit of the world: metres, millimetres or arbitrary."""
         self.points: SparsePoints | None = posed.points
-        """Sparse points of the world with which images see them, if the format has any."""
+        """Sparse world points with the images that see them, if the format has any."""
         self.left_out: tuple[tuple[str, str], ...] = posed.left_out
         """Names of images that have no pose, each with the reason as a clause."""
         self.T_cw: Float64[np.ndarray, "n 4 4"] = np.stack([file.T_cw for file in posed.files])
@@ -79,7 +79,7 @@ class PosedSource:
 
     @property
     def intrinsics_origin(self) -> str:
-        """Where the intrinsics come from."""
+        """Origin of the intrinsics."""
         return self._one_camera.origin
 
     @property
@@ -91,13 +91,13 @@ class PosedSource:
         return self.length
 
     def fingerprint(self) -> str:
-        """Sixteen digits that change with the names and sizes of the images."""
+        """Sixteen digits that depend on the names and sizes of the images."""
         return fingerprint_of([file.path for file in self._files])
 
     def stored_bytes(self) -> list[int]:
-        """Size of the file of each image; 0 where it is gone.
+        """Size of each image file; 0 where it is gone.
 
-        Of images of the same thing by the same camera, a blurred one takes least.
+        Of images of the same scene by the same camera, a blurred one is smallest.
         """
         return [size_of(file.path) or 0 for file in self._files]
 
@@ -123,10 +123,10 @@ class PosedSource:
 
 
 def held_out_places(count: int, every: int | None) -> range:
-    """Which of ``count`` images are left out where every ``every``-th is; none where that is none.
+    """Indices of the held-out images of ``count``, every ``every``-th; empty if that is none.
 
     Raises:
-        InputError: fewer than two images would be left, or ``every`` leaves none.
+        InputError: ``every`` is below 2, or fewer than two images would remain.
     """
     if every is None:
         return range(0)

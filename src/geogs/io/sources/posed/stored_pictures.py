@@ -1,4 +1,4 @@
-"""Read the pictures and masks of an image set as they are stored."""
+"""Read the stored pictures and masks of an image set."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def read_picture(
         size: width and height it must have.
         needed: width and height that suffice: a JPEG of a known size is decoded at a half, a
             quarter or an eighth of it, which averages whole blocks of pixels, where that is no
-            smaller. That takes a part of the time and the memory.
+            smaller. That saves time and memory.
 
     Raises:
         InputError: it is missing or damaged, or of another size.
@@ -51,8 +51,8 @@ def read_picture(
 
 
 def reduction(size: tuple[int, int], needed: tuple[int, int]) -> int:
-    """The largest of 8, 4, 2 and 1 parts into which both sides can be divided without a rest, such
-    that no side becomes smaller than needed."""
+    """The largest of 8, 4, 2 and 1 that divides both sides without a rest, such that no side
+    becomes smaller than needed."""
     fits = (
         n
         for n in (8, 4, 2)

@@ -36,7 +36,7 @@ _METADATA = "metadata.yaml"
 _SUFFIXES = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg")
 """Suffixes that image transports add to the name of a topic."""
 _LOOKED_AT = 30
-"""Messages from which the rate is measured, and among which the first picture must be."""
+"""Number of messages used for the rate; the first picture must be among them."""
 
 
 def is_bag(path: Path) -> bool:
@@ -52,7 +52,7 @@ class Bag:
     """Reader of the images of one topic."""
 
     def __init__(self, path: Path, topic: str = "auto") -> None:
-        """``topic`` is that of the images, or ``auto`` for the one that most likely is the camera.
+        """``topic`` is that of the images, or ``auto`` for the most likely camera.
 
         Raises:
             InputError: ``rosbags`` is not installed, the bag is damaged, or has no such images.
@@ -76,7 +76,7 @@ class Bag:
 
     @property
     def paths(self) -> list[Path]:
-        """The files that are read, the one with the index of a ROS 2 bag left out."""
+        """The files that are read, without the metadata of a ROS 2 bag."""
         if not self._path.is_dir():
             return [self._path]
         files = (path for path in self._path.iterdir() if path.is_file())
@@ -108,7 +108,7 @@ class Bag:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A bag, closed at the end. Raises InputError for what its reader stumbles over."""
+    """Open a bag, and close it at the end. Raises InputError for errors of its reader."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -118,10 +118,10 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from error
     _require_files(path)
     try:
-        # The images' types are alike in all of ROS 2, whose older bags do not describe them.
+        # The image types are the same in all of ROS 2, whose older bags do not describe them.
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         bag.open()
-    except Exception as error:  # of its own, of SQLite, of YAML, of whatever a damaged file causes
+    except Exception as error:  # errors of its own, of SQLite, of YAML, of a damaged file
         raise InputError(
             f"{path} cannot be opened as a recording of ROS; is it complete and closed?"
         ) from error
@@ -129,15 +129,15 @@ def _opened(path: Path) -> Iterator[Any]:
         yield bag
     except (GeogsError, MemoryError):
         raise
-    except Exception as error:  # what an index that opened well may still lead its reader to
+    except Exception as error:  # a damaged index may fail later, too
         raise InputError(f"{path} is damaged as a recording of ROS; copy it again.") from error
     finally:
-        with suppress(Exception):  # a damaged index may lead it astray here, too
+        with suppress(Exception):  # closing may fail, too
             bag.close()
 
 
 def _require_files(path: Path) -> None:
-    """Raise InputError where what the reader will open is no plain file of the recording."""
+    """Raise InputError where the reader would open anything but plain files of the recording."""
     if not path.is_dir():
         require_file(path)
         return
@@ -154,7 +154,7 @@ def _require_files(path: Path) -> None:
 
 
 def _chosen(bag: Any, path: Path, asked: str) -> str:
-    """The topic to read: that asked for, or the likeliest. Raises InputError without any."""
+    """The topic to read: the given one, or the likeliest. Raises InputError without any."""
     topics = {t: info.msgcount for t, info in bag.topics.items() if _has_images(bag, t)}
     listed = ", ".join(sorted(topics)) or "none"
     if asked != "auto":
@@ -171,8 +171,8 @@ def _chosen(bag: Any, path: Path, asked: str) -> str:
 
 
 def _likelihood(bag: Any, topic: str) -> tuple[bool, bool, bool]:
-    """Colour before infrared, with a camera before without, the left of two as sorted, raw before
-    compressed."""
+    """Sort key: colour before infrared, with camera info before without, raw before compressed; of
+    equal ones the first by name, the left of two."""
     base = _without_transport(topic).lower()
     is_other = any(word in base for word in ("infra", "/ir/", "thermal", "depth", "mask", "debug"))
     return not is_other, _camera_topic(bag, topic) is not None, base == topic.lower()
@@ -233,12 +233,12 @@ def _read(bag: Any, connection: Any, data: bytes) -> Any:
     """The message; none where it is damaged."""
     try:
         return bag.deserialize(data, connection.msgtype)
-    except Exception:  # whatever wrong lengths make its reader stumble over
+    except Exception:  # wrong lengths may raise any exception
         return None
 
 
 def _stamp(message: Any) -> float:
-    """Seconds of the header; 0 where nobody has set it."""
+    """Time of the header in seconds; 0 where it is not set."""
     stamp = message.header.stamp
     return float(stamp.sec) + float(stamp.nanosec) * 1e-9
 

@@ -1,5 +1,5 @@
 """Content of ROS messages: pictures (``sensor_msgs/Image``, ``CompressedImage``) and the camera
-(``sensor_msgs/CameraInfo``) of images as the sensor gave them."""
+(``sensor_msgs/CameraInfo``) of unprocessed images."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ from geogs.io.pictures import Decoded, decoded_bytes
 from geogs.io.sources.calibration import Calibration
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-"""Names of the types, those of ROS 1 too as ``rosbags`` gives them."""
+"""Names of the types; ``rosbags`` gives those of ROS 1 the same names."""
 
-# Bytes a pixel, and how OpenCV comes to RGB from there; none where it is RGB already.
+# Bytes per pixel, and OpenCV's conversion to RGB; none where it is RGB already.
 # OpenCV names Bayer patterns by the second row and column, ROS by the first.
 _TO_RGB: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -36,15 +36,15 @@ _TO_RGB: dict[str, tuple[int, int | None]] = {
 }
 _MONO_16 = "mono16"
 _LARGEST = 1 << 16
-"""Pixels of a side."""
+"""Longest side in pixels."""
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-"""Name of the type, that of ROS 1 too as ``rosbags`` gives it."""
+"""Name of the type; ``rosbags`` gives that of ROS 1 the same name."""
 _FISHEYES = ("equidistant", "fisheye")
 _POLYNOMIALS = ("plumb_bob", "rational_polynomial", "")
 
 
 def is_picture(message: Any) -> bool:
-    """Whether a message of one of the two types holds light, in a form that can be read here.
+    """Whether a message of one of the two types holds a readable colour or grey image.
 
     Depth and disparity come in the same types.
     """
@@ -63,7 +63,7 @@ def picture_of(message: Any) -> Decoded:
 
 
 def _raw(message: Any) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Rows may be longer than their pixels; 16 bits of grey lose the lower eight."""
+    """Decode a raw image; rows may be padded, and 16-bit grey loses the lower eight bits."""
     encoding, width, height = str(message.encoding).lower(), message.width, message.height
     is_16_bit = encoding == _MONO_16
     bytes_a_pixel, code = (2, None) if is_16_bit else _TO_RGB.get(encoding, (0, None))
@@ -86,13 +86,13 @@ def _raw(message: Any) -> UInt8[np.ndarray, "h w 3"] | None:
 
 
 def calibration_of(message: Any, topic: str, is_rectified: bool) -> Calibration | None:
-    """The calibration in a message; none where it says that this is unknown.
+    """The calibration in a message; none where it marks it as unknown.
 
     Args:
-        message: of ROS 1 or ROS 2, which call the same things K and k.
-        topic: on which it came, for sentences.
-        is_rectified: whether the images that it goes with have been rectified already, so that its
-            projection matrix holds and no distortion.
+        message: of ROS 1 or ROS 2, which name the entries K and k.
+        topic: its topic, for error messages.
+        is_rectified: whether its images have been rectified already, so that its projection
+            matrix applies, without distortion.
 
     Raises:
         InputError: its lens is of a model that is not supported.

@@ -1,4 +1,4 @@
-"""Records that all formats of exports share: posed images, and points with who sees them."""
+"""Records of all export formats: posed images, and points with the images that see them."""
 
 from dataclasses import dataclass
 

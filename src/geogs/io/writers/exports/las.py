@@ -9,7 +9,7 @@ from geogs.errors import InputError
 from geogs.io.writers.atomic import atomic_file
 
 _STEPS = 1e9
-"""Steps of a coordinate over the extent, well within the 32 bits that LAS has."""
+"""Steps of a coordinate over the extent, within the 32 bits of LAS."""
 
 
 def write_las(

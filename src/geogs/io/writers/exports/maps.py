@@ -1,4 +1,4 @@
-"""Depth and normal maps: 16-bit PNG for programs that read images, NPZ with every digit."""
+"""Depth and normal maps: 16-bit PNG for programs that read images, NPZ in full precision."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ STEPS = 65535
 
 
 def depth_unit(farthest: float) -> float:
-    """Map units of a step of a depth image: the least power of ten that holds the farthest one."""
+    """Map units per step of a depth image: the least power of ten that holds the farthest depth."""
     return float(10.0 ** np.ceil(np.log10(max(farthest, 1e-30) / STEPS)))
 
 
@@ -41,6 +41,6 @@ def write_npz(path: Path, name: str, values: Float32[np.ndarray, "..."]) -> None
 
 
 def write_description(path: Path, camera: Camera, meaning: dict[str, object]) -> None:
-    """``description.json``: the camera of the maps, and what their numbers mean."""
+    """Write ``description.json``: the camera of the maps, and the meaning of their numbers."""
     document = {**pinhole(camera), "first_pixel_centre": [0, 0], **meaning}
     write_text(path, json.dumps(document, indent=2) + "\n")

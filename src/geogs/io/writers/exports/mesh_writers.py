@@ -23,17 +23,17 @@ _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
 _UNLIT = "KHR_materials_unlit"
 
 Material = dict[str, object]
-"""Entries of the document that say what the surface looks like."""
+"""Entries of the document for the material."""
 
 _ROUGH = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
 PLAIN: Material = {"materials": [{"pbrMetallicRoughness": _ROUGH, "doubleSided": True}]}
 """Rough, seen from both sides, in the colours of the vertices."""
 ONE_SIDED: Material = {"materials": [{"pbrMetallicRoughness": _ROUGH}]}
-"""The same, not seen from behind, so that one looks into a room from outside."""
+"""The same, transparent from behind, so that a room can be seen from outside."""
 
 
 class GltfBuffer:
-    """Arrays one after the other, and how the document names them."""
+    """Binary buffer of arrays, with their entries in the document."""
 
     def __init__(self) -> None:
         self._accessors: list[dict[str, object]] = []
@@ -43,7 +43,7 @@ class GltfBuffer:
     def add_surface(
         self, vertices: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
     ) -> dict[str, int]:
-        """Vertices and normals, with axes turned to those of glTF. Returns their numbers."""
+        """Add vertices and normals, in the axes of glTF. Returns their accessor numbers."""
         axes = OPENCV_FROM_OPENGL[:3, :3]
         return {
             "POSITION": self.add(vertices @ axes, "VEC3", has_range=True),
@@ -51,7 +51,7 @@ class GltfBuffer:
         }
 
     def add(self, values: Float[np.ndarray, "n k"], kind: str, has_range: bool = False) -> int:
-        """Numbers of the vertices, as float32; ``has_range`` for positions. Returns its number."""
+        """Add vertex data as float32; ``has_range`` for positions. Returns the accessor number."""
         rows = values.astype("<f4")
         entry: dict[str, object] = {"componentType": _FLOAT, "type": kind}
         if has_range:
@@ -59,17 +59,17 @@ class GltfBuffer:
         return self._accessor(rows, _VERTICES, entry)
 
     def add_steps(self, values: UInt16[np.ndarray, "n 4"]) -> int:
-        """Shares of the vertices in steps of 1 / 65535."""
+        """Add vertex colours in steps of 1 / 65535. Returns the accessor number."""
         entry = {"componentType": _UINT16, "type": "VEC4", "normalized": True}
         return self._accessor(values, _VERTICES, entry)
 
     def add_corners(self, faces: Int[np.ndarray, "m 3"]) -> int:
-        """Vertices of the triangles."""
+        """Add the vertex indices of the triangles. Returns the accessor number."""
         entry: dict[str, object] = {"componentType": _UINT32, "type": "SCALAR"}
         return self._accessor(faces.astype("<u4").reshape(-1), _CORNERS, entry)
 
     def textured(self, jpeg: bytes) -> Material:
-        """The material of a surface that shows an image just as it is."""
+        """The unlit material of a surface with a texture."""
         picture = {"mimeType": "image/jpeg", "bufferView": self._view(jpeg)}
         filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP}
         surface = {"baseColorTexture": {"index": 0}, **_ROUGH}
@@ -129,7 +129,7 @@ def glb(
 ) -> bytes:
     """glTF 2.0 in one file: y up, looking along -z, counter-clockwise faces.
 
-    The world is turned by a half turn about x, so that what was down in the first image is down.
+    The world is rotated by 180 degrees about x, so that down in the first image is down.
     Colours are linear in the file, as glTF has them; ours are sRGB.
     """
     gltf = GltfBuffer()
@@ -152,9 +152,9 @@ def write_textured_glb(
 ) -> None:
     """Write glTF 2.0 in one file, with axes as ``glb`` has them and a JPEG inside.
 
-    Light is in the texture already, so the material asks to be shown as it is
-    (KHR_materials_unlit); readers that do not know that see a rough surface. ``uv`` is
-    in pixels of the texture, whose centres are at integers.
+    Light is in the texture already, so the material is unlit (KHR_materials_unlit); readers
+    without that extension show a rough surface. ``uv`` is in pixels of the texture, whose
+    centres are at integers.
     """
     gltf, size = GltfBuffer(), np.array(texture.shape[1::-1])
     attributes = gltf.add_surface(vertices, normals)
@@ -177,7 +177,7 @@ def write_obj(
     normals: Float[np.ndarray, "n 3"],
     colours: UInt8[np.ndarray, "n 3"] | None,
 ) -> None:
-    """Write text with normals, y up as in ``glb``; sRGB from 0 to 1 stands behind x, y, z."""
+    """Write text with normals, y up as in ``glb``; sRGB from 0 to 1 follows x, y, z."""
     axes = OPENCV_FROM_OPENGL[:3, :3]
     rows = vertices @ axes
     if colours is not None:

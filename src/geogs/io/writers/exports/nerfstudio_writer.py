@@ -16,7 +16,7 @@ from geogs.io.writers.atomic import write_text
 from geogs.io.writers.exports.exported import ExportedImage
 
 DEPTH_UNIT = 1e-3
-"""Map units of a step of a depth image, as nerfstudio takes it where nothing is said."""
+"""Map units per step of a depth image, nerfstudio's default."""
 
 
 def write_transforms(
@@ -30,10 +30,10 @@ def write_transforms(
 
     Args:
         path: the file.
-        camera: of all images.
+        camera: camera of all images.
         images: names as they are in ``images/``; depth, normals and masks are PNG of that stem.
-        masked: which of them have a mask.
-        depth_unit: map units of a step of a depth image.
+        masked: whether each image has a mask.
+        depth_unit: map units per step of a depth image.
     """
     frames = []
     for image, has_mask in zip(images, masked, strict=True):

@@ -17,8 +17,8 @@ from geogs.world.lru import LruCache
 class KnownViews:
     """The keyframes' images, constants and poses on the GPU, brought up to date on demand.
 
-    At most ``resident`` of them, unless more are asked for at once. The least recently used gives
-    its slot away, and with it its rendered depth.
+    At most ``resident`` of them, unless more are requested at once. The least recently used loses
+    its slot, and with it its rendered depth.
     """
 
     def __init__(self, cameras: MapCameras, device: torch.device, resident: int) -> None:
@@ -47,7 +47,7 @@ class KnownViews:
         return slots
 
     def _new_slot(self, view: MapView) -> int:
-        """A slot that now holds the view."""
+        """Put the view into a free slot and return the slot."""
         if not self._unused:
             return self.table.add(view.constants, view.photo)
         slot = self._unused.pop()
@@ -60,7 +60,7 @@ class KnownViews:
         self._unused.append(slot)
 
     def set_poses(self, ids: Sequence[int], T_cw: Float[Tensor, "k 4 4"]) -> None:
-        """Poses to work with until ``slots`` is asked for again."""
+        """Set poses that count until ``slots`` is called again."""
         slots = [slot for i in ids if (slot := self._slots.peek(i)) is not None]
         self.table.set_poses(slots, T_cw)
         for i in ids:

@@ -28,7 +28,7 @@ def refine_poses(
     """As :func:`geogs.mapping.training.pose_refine.refine_poses`, from the same loss in float32.
 
     ``window`` has as many views as there are active keyframes, one partner each. Each step waits
-    once, for the gradients of the poses, which are few and go on on the CPU.
+    once, for the gradients of the poses; the descent itself runs on the CPU.
     """
     partners = [views[i] for view in active for i in view.row.partners[:1]]
     slot = dict(zip((v.id for v in (*active, *partners)), known.slots([*active, *partners]),
@@ -73,7 +73,7 @@ def _chain(
     d_poses: Float[Tensor, "b 4 4"],
     d_motions: Float[Tensor, "b 3 4"],
 ) -> Float[Tensor, ""]:
-    """A scalar whose gradient in the poses is the loss's."""
+    """A scalar with the loss's gradient with respect to the poses."""
     pose_of = {view.id: T for view, T in zip(active, poses, strict=True)}
     total = (poses * d_poses).sum()
     for k, view in enumerate(active):

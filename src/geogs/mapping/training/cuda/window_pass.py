@@ -69,17 +69,17 @@ class WindowPass:
             )
 
     def is_outdated(self, disks: GaussianMap) -> bool:
-        """Whether the map or the table have moved in memory since."""
+        """Whether the map or the table has moved in memory since this was made."""
         return self.table.generation != self._generation or disks.capacity != self.capacity
 
     def reserve(self, entries: int) -> None:
-        """Make room in the lists for so many entries in all."""
+        """Make room in the lists for ``entries`` in all."""
         self.rasterizer.reserve(entries)
         if self._partners is not None:
             self._partners[0].reserve(entries)
 
     def launch(self, disks: DiskParameters, count: Int[Tensor, "1"]) -> None:
-        """Maps, losses and gradients of the views in ``batch``; ``disks`` have all their room."""
+        """Compute maps, losses and gradients of ``batch``; ``disks`` include their spare room."""
         if self._partners is not None:
             shown, maps = self._partners
             others = self.pairs.view(-1)
