@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from geogs.application.progress.forecast import Clock
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views
@@ -22,6 +21,7 @@ from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.reconstruction import Reconstruction
 
 _log = logging.getLogger(__name__)
+Clock = Callable[[], float]
 
 VIEWS = 3
 """Number of views of the trial; before it, one view alone does the one-time preparations."""

@@ -1,9 +1,9 @@
 """The camera system: the equations of all poses once the depths are eliminated; float64.
 
-The dense one has the shared unknowns of a problem, too. That of a large adjustment has only the
-blocks that exist: frames are put in reverse Cuthill-McKee order, which leaves a narrow band for a
-walk, also for one that comes back, and the band is factored by Cholesky's method. At worst, when
-all frames see each other, the band is the whole lower triangle.
+The dense one has the shared unknowns of a problem, too. That of a large adjustment only has the
+existing blocks: frames are in reverse Cuthill-McKee order, which gives a narrow band for a walk,
+even with revisits, and the band is factored by Cholesky's method. At worst, when all frames see
+each other, the band is the whole lower triangle.
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,12 +25,12 @@ class DenseCameraSystem:
         self.frames = len(free_pose)
         free = [*free_pose.repeat_interleave(6).tolist(), *free_shared]
         self.free = torch.nonzero(torch.tensor(free))[:, 0]
-        """Which rows may move."""
+        """Indices of the free rows."""
         self.hessian = torch.zeros(len(free), len(free), dtype=torch.float64)
         self.gradient = self.hessian.new_zeros(len(free))
 
     def add(self, edges: Iterable[HyperEdge]) -> None:
-        """Add what hyper-edges say of their unknowns."""
+        """Add the equations of hyper-edges."""
         for edge in edges:
             rows = edge.rows(self.frames)
             hessian, gradient = edge.chained()
@@ -38,7 +38,7 @@ class DenseCameraSystem:
             self.gradient.index_add_(0, rows, gradient)
 
     def solve(self, damping: float, floor: float) -> Float[Tensor, "v"] | None:
-        """Steps of all unknowns, zero for the fixed; None where the system is not definite.
+        """Solve for steps of all unknowns, zero for fixed ones; None if not positive definite.
 
         The diagonal D is raised by ``damping`` |D| + ``floor``.
         """
@@ -57,11 +57,11 @@ class DenseCameraSystem:
 
 @dataclass(frozen=True)
 class PoseSums:
-    """What some sources say of the poses, summed up, for others to add to what they know."""
+    """Summed equations of the poses from some sources, to be added to another system."""
 
     row: Int[Tensor, "m"]
     column: Int[Tensor, "m"]
-    """Frames that each block joins; no two frames have more than one."""
+    """Frames of each block; at most one block for two frames."""
     blocks: Float[Tensor, "m 6 6"]
     frame: Int[Tensor, "k"]
     gradient: Float[Tensor, "k 6"]
@@ -70,7 +70,7 @@ class PoseSums:
 class SparseCameraSystem:
     """Blocks of the lower triangle over the free poses, and the right-hand side; all float64.
 
-    Hyper-edges are added one after the other, so that none has to be kept.
+    Hyper-edges are added one by one, so that none has to be stored.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SparseCameraSystem:
         for frame, e in sources_within(source):
             at = self._slot[torch.cat([target[e], torch.tensor([frame])])]
             keys.append(np.unique(_lower(at, n)[0].numpy()))
-        # Every diagonal block is listed, so that a frame without edges has one as well.
+        # Every diagonal block is listed, also of frames without edges.
         self._keys = torch.from_numpy(np.unique(np.concatenate(keys)))
         self.clear()
 
@@ -94,7 +94,7 @@ class SparseCameraSystem:
 
     @property
     def bandwidth(self) -> int:
-        """Frames by which the two of a block lie apart at most, in the order of the system."""
+        """Largest distance between the two frames of a block, in the order of the system."""
         if not self._count:
             return 0
         return int((self._keys // self._count - self._keys % self._count).max())
@@ -107,20 +107,20 @@ class SparseCameraSystem:
     def block_indices(
         self, row: Int[np.ndarray, "k"], column: Int[np.ndarray, "k"]
     ) -> Int[np.ndarray, "k"]:
-        """Which block belongs to each pair of frames; -1 above the diagonal and for fixed poses."""
+        """Return the block of each pair of frames; -1 above the diagonal and for fixed poses."""
         slot = self._slot.numpy()
         i, j = slot[row], slot[column]
         found = np.searchsorted(self._keys.numpy(), i * self._count + j)
         return np.where((i >= j) & (j >= 0), found, -1)
 
     def add_sums(self, blocks: Float[Tensor, "m 6 6"], gradient: Float[Tensor, "n 6"]) -> None:
-        """Add to all blocks, and the right-hand sides of all frames, what others have summed up."""
+        """Add given sums to all blocks, and to the right-hand sides of all frames."""
         self._blocks += blocks
         free = self._free
         self._gradient.index_add_(0, self._slot[free], gradient[free])
 
     def add(self, edges: Iterable[HyperEdge]) -> None:
-        """Add what hyper-edges say of the poses; nothing may be shared."""
+        """Add the equations of hyper-edges without shared unknowns."""
         for edge in edges:
             block, gradient = edge.pose_blocks()
             at = self._slot[edge.poses]
@@ -131,14 +131,14 @@ class SparseCameraSystem:
             self._blocks.index_add_(0, place, block[rows, columns])
 
     def sums(self, numbers: Int[Tensor, "n"]) -> PoseSums:
-        """All that has been added, by the numbers that the frames have elsewhere."""
+        """Return all sums, with ``numbers`` as indices of the frames."""
         at = torch.empty(self._count, dtype=torch.long)
         at[self._slot[self._free]] = numbers[self._free]
         row, column = at[self._keys // self._count], at[self._keys % self._count]
         return PoseSums(row, column, self._blocks, at, self._gradient)
 
     def add_elsewhere_summed(self, sums: PoseSums) -> None:
-        """Add what a system of some of the sources has summed up."""
+        """Add the sums of a system of some of the sources."""
         i, j = self._slot[sums.row], self._slot[sums.column]
         known = (i >= 0) & (j >= 0)
         blocks = torch.where((i < j)[:, None, None], sums.blocks.mT, sums.blocks)[known]
@@ -148,7 +148,7 @@ class SparseCameraSystem:
         self._gradient.index_add_(0, at[at >= 0], sums.gradient[at >= 0])
 
     def solve(self, damping: float, floor: float) -> Float[Tensor, "v"] | None:
-        """Steps of all poses, zero for the fixed; None where the system is not definite."""
+        """Solve for steps of all poses, zero for fixed ones; None if not positive definite."""
         xi = torch.zeros(len(self._free), 6, dtype=torch.float64)
         if not self._count:
             return xi.reshape(-1)
@@ -183,7 +183,7 @@ class SparseCameraSystem:
 def _ordered_slots(
     source: Int[Tensor, "e"], target: Int[Tensor, "e"], free_pose: Bool[Tensor, "n"]
 ) -> Int[Tensor, "n"]:
-    """Place of each frame in the system, -1 where its pose is fixed."""
+    """Return the slot of each frame in the system, -1 where its pose is fixed."""
     n = int(free_pose.sum())
     slot = torch.full((len(free_pose),), -1, dtype=torch.long)
     slot[free_pose] = torch.arange(n)
@@ -192,7 +192,7 @@ def _ordered_slots(
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-    # Edges that share a source are joined by the elimination: two steps in the graph of pairs.
+    # Elimination joins edges that share a source: two steps in the graph of pairs.
     i, j = slot[source].numpy(), slot[target].numpy()
     both = (i >= 0) & (j >= 0)
     graph = coo_matrix((np.ones(int(both.sum())), (i[both], j[both])), shape=(n, n)).tocsr()
@@ -207,7 +207,7 @@ def _ordered_slots(
 def _lower(
     at: Int[Tensor, "k"], count: int
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Int[Tensor, "m"]]:
-    """Keys row * count + column of the blocks that some poses span, and which poses they join."""
+    """Return keys row * count + column of the blocks of some poses, and the poses of each."""
     wanted = (at[:, None] >= at[None]) & (at[None] >= 0)
     rows, columns = torch.nonzero(wanted, as_tuple=True)
     return at[rows] * count + at[columns], rows, columns

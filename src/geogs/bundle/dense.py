@@ -1,8 +1,8 @@
 """Dense bundle adjustment over poses and inverse depths on the CPU.
 
 Gauss-Newton on ``sum_e sum_p rho(|W^(1/2) (target - project(T_j T_i^-1, d_i))|)``, DROID-SLAM's
-dense BA layer, see :mod:`geogs.bundle.flow_term`, and on the problem's other terms. All that is
-linearised is kept until the next step, and the camera system is dense.
+dense BA layer, see :mod:`geogs.bundle.flow_term`, and on the problem's other terms. Linearised
+edges are kept until the next step, and the camera system is dense.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from geogs.threads import thread_map
 from geogs.world.grid import SampleGrid
 
 FLOOR = 1e-2
-"""Added to the diagonal of the camera system, beside its damping."""
+"""Constant added to the diagonal of the camera system, besides damping."""
 
 
 class DenseBundle:
@@ -41,11 +41,11 @@ class LinearBundle:
 
     system: DenseCameraSystem
     sources: list[SourceFlow]
-    """With all terms of their depths."""
+    """Sources, with all terms of their depths."""
 
 
 class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
-    """One adjustment that keeps all that it linearises."""
+    """One adjustment that keeps all linearised edges."""
 
     floor = FLOOR
 
@@ -54,7 +54,7 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
         self.flow = flow
 
     def linearise(self, state: BundleState) -> LinearBundle:
-        """Chunks of edges side by side, always summed up in the same order."""
+        """Linearise chunks of edges in parallel, always summed in the same order."""
         problem, options = self.problem, self.options
         chunks = source_chunks(problem.source, options.chunk)
 
@@ -72,7 +72,7 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
         return LinearBundle(system, sources)
 
     def flow_cost(self, state: BundleState) -> float:
-        """Chunks of edges side by side."""
+        """Compute the cost of chunks of edges in parallel."""
         problem, options = self.problem, self.options
 
         def work(chunk: slice) -> float:
@@ -81,13 +81,13 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
         return sum(thread_map(work, source_chunks(problem.source, options.chunk)))
 
     def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
-        """The solution by Cholesky's method."""
+        """Solve by Cholesky's method."""
         return linear.system.solve(damping, self.floor)
 
     def depth_steps(
         self, state: BundleState, linear: LinearBundle, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """The depths that follow by the couplings that were kept."""
+        """Compute the depth steps from the stored couplings."""
         delta = torch.zeros_like(state.inverse_depth)
         for source in linear.sources:
             if bool(self.problem.free_depth[source.frame]):

@@ -1,4 +1,4 @@
-"""Terms of single inverse depths: what resists their change, and what a sensor has measured."""
+"""Terms of single inverse depths: damping, and sensor depths."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,37 +12,37 @@ from geogs.bundle.terms import BundleState
 from geogs.geometry.robust import huber_cost, huber_weight
 
 MEASURED_HUBER = 3.0
-"""Deviations of a measured depth beyond which it counts linearly. Matches have a smaller knee: they
-are wrong altogether more often than what a sensor says away from edges."""
+"""Huber threshold of a measured depth, in deviations. That of matches is smaller: they are outliers
+more often than sensor depths away from edges."""
 
 
 @dataclass(frozen=True)
 class DepthDamping:
-    """Resistance to a change of each inverse depth that measures nothing: DROID-SLAM's eta."""
+    """Damping of each inverse depth, without any measurement: DROID-SLAM's eta."""
 
     curvature: Float[Tensor, "n p"]
-    """Added to that of the matches, sum_e w |dp/dd|^2."""
+    """Curvature added to that of the matches, sum_e w |dp/dd|^2."""
     information: ClassVar[None] = None
-    """It measures nothing."""
+    """None: nothing is measured."""
 
     def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
         return DepthEquations.alone(self.curvature[frame])
 
     def cost(self, state: BundleState) -> float:
-        """Zero: it resists each step, wherever it begins."""
+        """Return zero: it damps each step, wherever it begins."""
         return 0.0
 
 
 @dataclass(frozen=True)
 class MeasuredDepths:
-    """Inverse depths that were measured beside the matches, each on its own; robust by Huber."""
+    """Inverse depths measured independently of the matches; Huber cost."""
 
     inverse_depth: Float[Tensor, "n p"]
     information: Float[Tensor, "n p"]
     """Inverse variances; 0 where nothing was measured."""
 
     def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
-        """a and a (measured - d), where a is the information times Huber's weight."""
+        """Return a and a (measured - d), where a is the information times Huber's weight."""
         information = self.information[frame]
         residual = self.inverse_depth[frame] - state.inverse_depth[frame]
         norm = information.sqrt() * residual.abs()

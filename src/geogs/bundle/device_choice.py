@@ -1,4 +1,4 @@
-"""Where poses and fields are worked on: on the CPU, or on the GPU that holds the depths."""
+"""Choice of the device for poses and fields: the CPU, or the GPU of the depths."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from geogs.world.keyframes import KeyframeSet
 
 
 def bundle_solver(grid: SampleGrid) -> BundleSolver[BundleProblem]:
-    """The solver for the device of a grid."""
+    """Return the solver for the device of a grid."""
     if grid.on_gpu:
         from geogs.bundle.cuda.dense import CudaDenseBundle
 
@@ -26,7 +26,7 @@ def bundle_solver(grid: SampleGrid) -> BundleSolver[BundleProblem]:
 
 
 def large_bundle_solver(grid: SampleGrid) -> BundleSolver[StreamedProblem]:
-    """The solver for the device of a grid whose memory is bounded."""
+    """Return the solver with bounded memory for the device of a grid."""
     if grid.on_gpu:
         from geogs.bundle.cuda.streamed import CudaStreamedBundle
 
@@ -37,7 +37,7 @@ def large_bundle_solver(grid: SampleGrid) -> BundleSolver[StreamedProblem]:
 
 
 def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> MotionSolver:
-    """The solver for the device of a grid; matches are those of some cells, or of all."""
+    """Return the solver for the device of a grid; matches are those of some cells, or of all."""
     if grid.on_gpu:
         from geogs.bundle.cuda.motion_only import CudaMotion
 
@@ -46,7 +46,7 @@ def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> Mo
 
 
 def grid_fields(grid: SampleGrid) -> GridFields:
-    """The operations on fields for the device of a grid."""
+    """Return the operations on fields for the device of a grid."""
     if grid.on_gpu:
         from geogs.bundle.cuda.fields import CudaFields
 
@@ -55,7 +55,7 @@ def grid_fields(grid: SampleGrid) -> GridFields:
 
 
 def keyframe_pairs(keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> KeyframePairs:
-    """Pairs (source, target) of keyframe ids."""
+    """Return pairs (source, target) of keyframe ids, on their device."""
     if keyframes.grid.on_gpu:
         from geogs.bundle.cuda.keyframe_pairs import CudaPairs
 

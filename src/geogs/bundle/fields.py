@@ -21,10 +21,10 @@ class GridFields:
     def fill(
         self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
     ) -> Float[Tensor, "*n p"]:
-        """Values where confidence is positive; elsewhere the mean of their surroundings.
+        """Keep values where confidence is positive; fill others with the mean around them.
 
         Push and pull: confidence-weighted means over growing blocks, taken from the finest level
-        that has any confidence near. Without any confidence the plain mean of a field is returned.
+        with any confidence nearby. Without any confidence the plain mean of a field is returned.
         """
         rows = (x.reshape(-1, self.grid.size) for x in (values, confidence))
         filled = [self._fill(*pair) for pair in zip(*rows, strict=True)]
@@ -47,9 +47,9 @@ class GridFields:
         inverse_depth: Float[Tensor, "p"],
         information: Float[Tensor, "p"],
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """Inverse depth and information of frame i as seen from frame j; nearest surface wins.
+        """Transfer inverse depth and information from frame i to frame j; nearest surface wins.
 
-        Cells that nothing falls on are filled from their surroundings and have no information.
+        Empty cells are filled from their surroundings and have no information.
         """
         grid = self.grid
         R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
@@ -63,15 +63,15 @@ class GridFields:
         kept = torch.where(nearest, information * z.square(), torch.zeros_like(z))
         transferred = torch.zeros_like(kept).scatter_reduce(0, cell, kept, "amax")
         seen = depth > 0
-        # A token confidence lets cells without information still be filled from, if weakly.
+        # A small confidence lets cells without information contribute weakly to filling.
         return self.fill(depth, torch.where(seen, transferred + 1e-6, 0.0)), transferred * seen
 
     def reproject(
         self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
     ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-        """Cells of each keyframe in a frame at ``T_cw``, and cells of that frame in the keyframe.
+        """Project cells of each keyframe into a frame at ``T_cw``, and the frame's cells back.
 
-        The frame has no depth of its own; it borrows the keyframe's.
+        The frame has no depth of its own; it uses the keyframe's.
         """
         both = [self._reproject(k, T) for k, T in zip(keyframes, T_cw, strict=True)]
         return torch.stack([there for there, _ in both]), torch.stack([back for _, back in both])

@@ -1,4 +1,4 @@
-"""The term of dense flow: from matches to normal equations, source by source.
+"""Term of dense flow: from matches to normal equations, source by source.
 
 Each edge is linearised in the motion of its target relative to its source
 (:class:`~geogs.bundle.hyper_edge.RelativeEdges`). Residuals and couplings are float32, the
@@ -21,19 +21,19 @@ from geogs.bundle.terms import BundleState
 from geogs.geometry.robust import huber_weight
 
 BEHIND = 10.0
-"""Residual of a cell that lies behind its target, in knees of Huber's cost. No step is drawn by
-that, and none is taken that brings many there."""
+"""Residual of a cell behind its target, in Huber thresholds. It has no gradient, but rejects steps
+that move many cells there."""
 
 
 @dataclass(frozen=True)
 class SourceFlow:
-    """The edges of one source, linearised."""
+    """Linearised edges of one source."""
 
     frame: int
     edges: HyperEdge
-    """With equations of the source's depths."""
+    """Edges, with equations of the source's depths."""
     diagonal: Float[Tensor, "c"] | None = None
-    """Diagonal of the chained equations before any depth is eliminated, where it is asked for."""
+    """Diagonal of the chained equations before any depth is eliminated, if requested."""
 
     @property
     def depth(self) -> DepthEquations:
@@ -49,26 +49,26 @@ class SourceFlow:
 
 @runtime_checkable
 class FlowTerm(Protocol):
-    """How the matches of a problem are linearised."""
+    """Linearisation of the matches of a problem."""
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """The sources of all edges, in order."""
+        """Yield the linearised sources of all edges, in order."""
         ...
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """Twice what is minimised: Huber's cost of all matched cells; one behind its target is
-        ``BEHIND`` hubers off."""
+        """Return Huber's cost of all matched cells (twice the objective); one behind its target has
+        a residual of ``BEHIND`` thresholds."""
         ...
 
 
 def linearised_sources(
     flow: FlowTerm, problem: BundleProblem, state: BundleState, options: BundleOptions
 ) -> list[SourceFlow]:
-    """All sources of a problem, joined with the other terms of their depths.
+    """Linearise all sources of a problem, with the other terms of their depths.
 
-    Depths that are free are eliminated from the equations of all else.
+    Free depths are eliminated from the other equations.
     """
     found = []
     for source in flow.sources(problem, state, options):
@@ -83,7 +83,7 @@ def linearised_sources(
 def weighed_residuals(
     p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-    """Measured less projected positions r, and their weights: none behind the target.
+    """Return measured less projected positions r, and their weights, zero behind the target.
 
     W is multiplied by Huber's weight of |W^(1/2) r|.
     """
@@ -95,7 +95,7 @@ def weighed_residuals(
 def normal_equations(
     wJ: Float[Tensor, "e 6 2 p"], J: Float[Tensor, "e 6 2 p"], residual: Float[Tensor, "e p 2"]
 ) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"]]:
-    """J^T W J and J^T W r of every edge, summed over its cells."""
+    """Return J^T W J and J^T W r of every edge, summed over its cells."""
     left = wJ.flatten(2)
     right = torch.cat([J.flatten(2), residual.mT.flatten(1)[:, None]], 1)
     both = (left @ right.mT).double()
@@ -103,12 +103,12 @@ def normal_equations(
 
 
 def damped_curvature(curvature: Float[Tensor, "p"], fraction: float) -> Float[Tensor, "p"]:
-    """Curvature of a frame's inverse depths, and a fraction of its mean."""
+    """Add a fraction of its mean to the curvature of a frame's inverse depths."""
     return curvature + fraction * curvature.mean() + 1e-8
 
 
 def residual_norms(
     p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
 ) -> Float[Tensor, "e p"]:
-    """Norm of each residual in its own standard deviations."""
+    """Return the norm of each residual in its own standard deviations."""
     return (weight * (pixels - p.pixels).square()).sum(-1).sqrt()

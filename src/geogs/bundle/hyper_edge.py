@@ -1,10 +1,10 @@
-"""Residuals that share unknowns, linearised: what terms hand to solvers.
+"""Linearised residuals with common unknowns: the interface between terms and solvers.
 
-A hyper-edge joins the poses of some frames, the inverse depths of one of them, and unknowns that
-the whole problem shares, such as a lens. It may be linearised in unknowns of its own, such as the
+A hyper-edge joins the poses of some frames, the inverse depths of one of them, and unknowns shared
+by the whole problem, such as a lens. It may be linearised in unknowns of its own, such as the
 relative motions of matches, with a chain to those of the problem. Depths are eliminated first,
-frame by frame, since each is tied to no other. Equations of depths are float32, all others
-float64.
+frame by frame, since they are not coupled with each other. Equations of depths are float32, all
+others float64.
 """
 
 from collections.abc import Iterable
@@ -18,16 +18,16 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class DepthEquations:
-    """What is said of the inverse depths of a frame, and of others along with them."""
+    """Normal equations of a frame's inverse depths, and their coupling with other unknowns."""
 
     coupling: Float[Tensor, "m p"]
     """sum w dr/du dr/dd, with the unknowns u of the hyper-edge."""
     curvature: Float[Tensor, "p"]
-    """sum w |dr/dd|^2, and what else resists a change."""
+    """sum w |dr/dd|^2, plus damping."""
     gradient: Float[Tensor, "p"]
     """-sum w r . dr/dd, the direction of descent."""
     information: Float[Tensor, "p"]
-    """The part of the curvature that is known and not only a resistance."""
+    """The part of the curvature that is measured, without damping."""
 
     @staticmethod
     def alone(
@@ -35,7 +35,7 @@ class DepthEquations:
         gradient: Float[Tensor, "p"] | None = None,
         information: Float[Tensor, "p"] | None = None,
     ) -> "DepthEquations":
-        """Equations of depths that nothing else is tied to; a part not given is zero."""
+        """Return equations of depths without coupling; omitted parts are zero."""
         none, zero = curvature.new_zeros(0, len(curvature)), torch.zeros_like(curvature)
         return DepthEquations(
             none,
@@ -45,7 +45,7 @@ class DepthEquations:
         )
 
     def plus(self, other: "DepthEquations") -> "DepthEquations":
-        """The sum, where nothing but depths is in the other."""
+        """Return the sum, where the other has no coupling."""
         return DepthEquations(
             self.coupling,
             self.curvature + other.curvature,
@@ -54,24 +54,24 @@ class DepthEquations:
         )
 
     def on_cells(self, cells: slice) -> "DepthEquations":
-        """The equations of some of the cells, on the CPU."""
+        """Return the equations of some of the cells, on the CPU."""
         parts = (self.coupling, self.curvature, self.gradient, self.information)
         return DepthEquations(*(part[..., cells].cpu() for part in parts))
 
     def after(self, unknowns: Float[Tensor, "m"]) -> "DepthEquations":
-        """What is left of the depths alone after a step of all else: b - E^T u."""
+        """Return the equations of the depths alone after a step of all others: b - E^T u."""
         left = self.gradient - self.coupling.mT @ unknowns.to(self.coupling)
         return DepthEquations.alone(self.curvature, left, self.information)
 
     @property
     def solution(self) -> Float[Tensor, "p"]:
-        """The step of depths that nothing else is tied to any more."""
+        """Step of depths without coupling."""
         return self.gradient / self.curvature
 
     def reduce(
         self, hessian: Float[Tensor, "m m"], gradient: Float[Tensor, "m"]
     ) -> tuple[Float[Tensor, "m m"], Float[Tensor, "m"]]:
-        """The equations of the unknowns without the depths: H - E C^-1 E^T, g - E C^-1 b."""
+        """Eliminate the depths from the other equations: H - E C^-1 E^T, g - E C^-1 b."""
         E, C = self.coupling, self.curvature
         return (
             hessian - ((E / C) @ E.mT).to(hessian),
@@ -81,62 +81,62 @@ class DepthEquations:
 
 @dataclass(frozen=True)
 class HyperEdge:
-    """Linearised residuals, in the steps of the poses and of the shared unknowns themselves."""
+    """Residuals linearised directly in the steps of the poses and of the shared unknowns."""
 
     poses: Int[Tensor, "k"]
     """Frames whose poses it joins."""
     hessian: Float[Tensor, "m m"]
     gradient: Float[Tensor, "m"]
-    """The direction of descent."""
+    """Direction of descent."""
     shared: int = 0
-    """Number of the problem's shared unknowns, if it joins them; they come last."""
+    """Number of the problem's shared unknowns, if it has them; they come last."""
     depth: DepthEquations | None = None
 
     @property
     def chain(self) -> Float[Tensor, "m c"]:
-        """From steps of ``poses``, then of shared unknowns, to its own unknowns."""
+        """Matrix from steps of ``poses``, then of shared unknowns, to its own unknowns."""
         return torch.eye(len(self.gradient), dtype=self.gradient.dtype)
 
     def rows(self, frames: int) -> Int[Tensor, "c"]:
-        """Where ``poses``, then shared unknowns stand behind each other in those of a problem."""
+        """Return the indices of ``poses``, then of shared unknowns, among those of a problem."""
         poses = (6 * self.poses[:, None] + torch.arange(6)).reshape(-1)
         return torch.cat([poses, 6 * frames + torch.arange(self.shared)])
 
     def chained(self) -> tuple[Float[Tensor, "c c"], Float[Tensor, "c"]]:
-        """Hessian and gradient over ``poses``, then shared unknowns."""
+        """Return Hessian and gradient over ``poses``, then shared unknowns."""
         chain = self.chain
         return chain.mT @ self.hessian @ chain, chain.mT @ self.gradient
 
     def pose_blocks(self) -> tuple[Float[Tensor, "k k 6 6"], Float[Tensor, "k 6"]]:
-        """Hessian and gradient over ``poses`` in blocks, where nothing is shared."""
+        """Return Hessian and gradient over ``poses`` in blocks, without shared unknowns."""
         hessian, gradient = self.chained()
         n = len(self.poses)
         return hessian.reshape(n, 6, n, 6).transpose(1, 2), gradient.reshape(n, 6)
 
     def chained_coupling(self) -> Float[Tensor, "c p"]:
-        """Coupling of the depths with ``poses``, then shared unknowns."""
+        """Return the coupling of the depths with ``poses``, then shared unknowns."""
         assert self.depth is not None
         return self.chain.mT.to(self.depth.coupling) @ self.depth.coupling
 
     def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
-        """Equations of its depths after a step of all poses and shared unknowns."""
+        """Return equations of its depths after a step of all poses and shared unknowns."""
         assert self.depth is not None
         depth = replace(self.depth, coupling=self.chained_coupling())
         return depth.after(step[self.rows(frames)])
 
     def with_depths(self, others: Iterable[DepthEquations]) -> "HyperEdge":
-        """Joined with what else is said of the same depths alone."""
+        """Return it with other equations of the same depths added."""
         assert self.depth is not None
         return replace(self, depth=reduce(DepthEquations.plus, others, self.depth))
 
     def eliminated(self) -> "HyperEdge":
-        """With the depths out of the equations of all else."""
+        """Return it with the depths eliminated from the other equations."""
         assert self.depth is not None
         hessian, gradient = self.depth.reduce(self.hessian, self.gradient)
         return replace(self, hessian=hessian, gradient=gradient)
 
     def without_coupling(self) -> "HyperEdge":
-        """Without what is most of it and only needed for its depths."""
+        """Return it without the coupling, which is large and only needed for the depths."""
         assert self.depth is not None
         none = self.depth.coupling.new_zeros(0, len(self.depth.curvature))
         return replace(self, depth=replace(self.depth, coupling=none))
@@ -147,7 +147,7 @@ class RelativeEdges(HyperEdge):
     """Edges from a source to its targets, linearised in the motions of the targets relative to it.
 
     Only one Jacobian is formed; the chain to both poses is ``xi_rel = xi_j - Ad(T_ji) xi_i``. The
-    source is the last of the poses; beside the relative motions there may be shared unknowns.
+    source is the last of the poses; there may also be shared unknowns.
     """
 
     adjoint: Float[Tensor, "e 6 6"]
@@ -155,14 +155,14 @@ class RelativeEdges(HyperEdge):
 
     @property
     def chain(self) -> Float[Tensor, "m c"]:
-        """From steps of all poses, the source's last, then of shared unknowns."""
+        """Matrix from steps of all poses, the source's last, then of shared unknowns."""
         at = 6 * len(self.adjoint)
         eye = torch.eye(len(self.gradient), dtype=torch.float64, device=self.adjoint.device)
         source = torch.cat([-self.adjoint.flatten(0, 1), eye.new_zeros(self.shared, 6)])
         return torch.cat([eye[:, :at], source, eye[:, at:]], 1)
 
     def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
-        """Equations of the source's depths, by the relative motions alone."""
+        """Return equations of the source's depths, by the relative motions alone."""
         if self.shared or self.depth is None:
             return super().depth_after(step, frames)
         xi = step[: 6 * frames].reshape(frames, 6)

@@ -1,4 +1,4 @@
-"""Directed pairs of keyframes on the CPU: where cells fall, and how far that is."""
+"""Directed pairs of keyframes on the CPU: projections of cells, and distances."""
 
 from collections.abc import Sequence
 
@@ -10,10 +10,10 @@ from geogs.bundle.projection import project
 from geogs.world.keyframes import KeyframeSet
 
 LEAST_OVERLAP = 0.2
-"""A pair of which no more than this fraction of the cells falls into the other image is far."""
+"""Fraction of the cells that fall into the other image at or below which a pair is far."""
 
 CELL_STEP = 2
-"""Rows and columns of cells from one to the next that a distance is taken over."""
+"""Interval of the rows and columns of cells used for a distance."""
 
 
 class KeyframePairs:
@@ -25,19 +25,19 @@ class KeyframePairs:
         self.inverse_depth = keyframes.inverse_depths([e[0] for e in directed])
 
     def project(self) -> Float[Tensor, "e p 2"]:
-        """Where the cells of the sources fall in the targets."""
+        """Return the positions of the sources' cells in the targets."""
         grid = self.grid
         return project(grid.camera, grid.rays, self.motion, self.inverse_depth).pixels
 
     def moved(
         self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e"]:
-        """Median distance in pixels of the matched cells from where they fell before."""
+        """Return the median motion in pixels of the matched cells from ``before``."""
         moved = (self.project() - before).norm(dim=-1)
         return moved.masked_fill(~(weight[..., 0] > 0), torch.nan).nanmedian(dim=1).values
 
     def distances(self, rotation_weight: float) -> Float[Tensor, "e"]:
-        """DROID-SLAM's distance in pixels; infinite at little overlap.
+        """Return DROID-SLAM's distance in pixels; infinite at little overlap.
 
         Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the
         rest) over every second of the cells that stay in front of the target; infinite where

@@ -1,4 +1,4 @@
-"""The camera with unknowns: focal length and two radial terms, with exact Jacobians, and a readout.
+"""Camera with unknown focal length, radial terms and readout, with exact Jacobians.
 
 All enter twice: in the ray of a source's cell and in its projection into the target.
 """
@@ -15,13 +15,13 @@ from geogs.bundle.row_motions import RowMotions
 from geogs.geometry.camera import Camera
 
 UNIT = 0.01
-"""Seconds of a readout that is one in the equations: as large as other unknowns are."""
+"""Unit of the readout in the equations, seconds: it makes all unknowns of similar size."""
 
 
 @dataclass(frozen=True)
 class LensBlock:
-    """A lens as a block of unknowns: log of the focal length, k1, k2, and the readout where rows
-    roll."""
+    """A lens as a block of unknowns: log of the focal length, k1, k2, and the readout for a rolling
+    shutter."""
 
     lens: Camera
     pixels: Float[Tensor, "p 2"]
@@ -31,11 +31,11 @@ class LensBlock:
     radial: bool = False
     """Whether k1 and k2 are variables."""
     rows: RowMotions | None = None
-    """How frames move while they are read; none where all rows are seen at once."""
+    """Motion of frames during readout; None for a global shutter."""
     readout: float = 0.0
     """Seconds from the first to the last row: the last unknown where there are ``rows``."""
     rolls: bool = True
-    """Whether it is a variable."""
+    """Whether the readout is a variable."""
 
     @property
     def free(self) -> tuple[bool, ...]:
@@ -49,7 +49,7 @@ class LensBlock:
         return lens_rays(self.lens, self.pixels)
 
     def moved(self, step: Float[Tensor, "m"]) -> "LensBlock":
-        """The block after a step of all unknowns, zero for those that are no variables."""
+        """Return the block after a step of all unknowns, zero for those that are no variables."""
         *lens, longer = [*step.tolist(), 0.0][:4]
         return replace(self, lens=self.lens.moved(*lens), readout=self.readout + UNIT * longer)
 
@@ -60,8 +60,8 @@ class LensBlock:
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "n p"],
     ) -> Float[Tensor, "e p 2"] | None:
-        """Moves of where cells are found by a readout of a second; none where all rows are seen at
-        once."""
+        """Return derivatives of the cells' positions by the readout in seconds; None for a global
+        shutter."""
         if self.rows is None:
             return None
         return self.rows.slopes(self.lens, self.rays.rays, T_ji, inverse_depth, source, target)
@@ -69,7 +69,7 @@ class LensBlock:
     def unrolled(
         self, pixels: Float[Tensor, "e p 2"], slopes: Float[Tensor, "e p 2"] | None
     ) -> Float[Tensor, "e p 2"]:
-        """Where cells would have been found if all rows had been seen at once."""
+        """Correct positions of cells for the rolling shutter."""
         return pixels if slopes is None else pixels - self.readout * slopes
 
     def project(
@@ -79,23 +79,23 @@ class LensBlock:
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "e p"],
     ) -> CellProjection:
-        """Where the cells of the sources fall in the targets; depths are those of the sources."""
+        """Project the cells of the sources into the targets; depths are those of the sources."""
         T_ji = relative_motion(T_cw, source, target)
         return project(self.lens, self.rays.rays, T_ji, inverse_depth)
 
 
 @dataclass(frozen=True)
 class LensRays:
-    """Rays of pixels, with what a change of the lens does to them."""
+    """Rays of pixels, with their derivatives by the lens."""
 
     rays: Float[Tensor, "p 3"]
-    """z = 1."""
+    """Rays with z = 1."""
     slope: Float[Tensor, "3 p"]
-    """d x / d log f, d x / d k1 and d x / d k2 are these factors times x, and alike for y."""
+    """d x / d log f, d x / d k1 and d x / d k2 are these factors times x; likewise for y."""
 
 
 def lens_rays(camera: Camera, pixels: Float[Tensor, "p 2"]) -> LensRays:
-    """Rays of pixels of a camera."""
+    """Compute the rays of a camera's pixels."""
     x = camera.plane(pixels)
     square = x.square().sum(-1)
     growth, steep = camera.growth(square), camera.steepness(square)

@@ -1,7 +1,6 @@
-"""The term of dense flow on the CPU, by compiled loops over the cells of each source.
+"""Term of dense flow on the CPU, by compiled loops over the cells of each source.
 
-They are seen through a lens, whose sizes may be unknowns that all edges share; the tracker's is
-known.
+Cells are seen through a lens, whose parameters may be shared unknowns; the tracker's lens is known.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,25 +22,25 @@ from geogs.geometry.lie import se3_adjoint
 from geogs.world.grid import SampleGrid
 
 Further = Callable[[BundleProblem], Float[Tensor, "e o p 2"]]
-"""Moves of where cells fall by more unknowns of size one that all edges share."""
+"""Returns derivatives of the cells' positions by further shared unknowns."""
 
 
 class LensFlow:
-    """Dense flow of cells that are seen through the lens of a state, or one that is known."""
+    """Dense flow of cells seen through the lens of a state, or a known one."""
 
     def __init__(self, known: LensBlock | None = None, further: Further | None = None) -> None:
-        """The lens of the state is an unknown where none is ``known``."""
+        """If no lens is ``known``, that of the state is an unknown."""
         self._known, self._further = known, further
 
     @staticmethod
     def of(grid: SampleGrid) -> "LensFlow":
-        """Dense flow of the cells of a grid, seen through its camera."""
+        """Return the dense flow of the cells of a grid, seen through its camera."""
         return LensFlow(LensBlock(grid.camera, grid.pixels))
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """The sources of all edges, in order; with their diagonal where the lens is unknown."""
+        """Yield the sources of all edges, in order; with their diagonal if the lens is unknown."""
         from geogs.bundle.lens_kernels import linearise_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
@@ -92,7 +91,7 @@ class LensFlow:
 
 
 class _Edges:
-    """Edges and the lens as the kernels take them."""
+    """Edges and the lens as kernel arguments."""
 
     def __init__(
         self,

@@ -1,10 +1,10 @@
 """Compiled loops over the cells of a source that are seen through a lens in its targets.
 
-Arrays are C-contiguous, float32 but for what is summed over cells, which is float64: motions to the
+Arrays are C-contiguous and float32, except sums over cells, which are float64: motions to the
 targets (e, 3, 4), rays of the cells (2, p) with z = 1, the lens (6) as fx, fy, cx, cy, k1 and k2,
-inverse depths (p), found positions and their weights (e, p, 2). The kernels release the interpreter
-lock. Chains of small operations of PyTorch take ten times as long, and threads that call them wait
-for each other.
+inverse depths (p), measured positions and their weights (e, p, 2). The kernels release the
+interpreter lock. Chains of small PyTorch operations take ten times as long, and threads that call
+them wait for each other.
 """
 
 import numpy as np
@@ -15,18 +15,18 @@ from geogs.kernel_parts import inlined
 
 _FAST = {
     "cache": True, "nogil": True, "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "nsz", "arcp"},  # what is not finite has to show
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},  # non-finite values have to be kept
 }  # fmt: skip
 _PART = inlined(_FAST)
 _BLOCK = 64
-"""Cells whose derivatives are formed at a time: they stay in the first cache."""
+"""Cells whose derivatives are computed at a time: they fit into the L1 cache."""
 _ZERO, _ONE, _TWO, _THREE, _FOUR, _FIVE = map(np.float32, range(6))
 _LEAST_SLOPE = np.float32(LEAST_SLOPE)
 
 
 @njit(**_PART)
 def _seen(motion, x, y, d, nearest):
-    """A cell in a target: x / z and y / z, 1 / z, and whether it lies before it."""
+    """Project a cell into a target: x / z and y / z, 1 / z, and whether it is in front."""
     X = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] + motion[0, 3] * d
     Y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] + motion[1, 3] * d
     Z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] + motion[2, 3] * d
@@ -36,13 +36,13 @@ def _seen(motion, x, y, d, nearest):
 
 @njit(**_PART)
 def _unfolded(square, k1, k2):
-    """Whether the lens does not fold over what lies so far off its axis."""
+    """Whether the lens does not fold over at this squared distance from its axis."""
     return _ONE + square * (_THREE * k1 + _FIVE * square * k2) > _LEAST_SLOPE
 
 
 @njit(**_PART)
 def _dot(left, right):
-    """Scalar product of two blocks."""
+    """Return the scalar product of two blocks."""
     total = _ZERO
     for n in range(2 * _BLOCK):
         total += left[n] * right[n]
@@ -51,8 +51,8 @@ def _dot(left, right):
 
 @njit(**_PART)
 def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limits, J, r, w):
-    """Derivatives of some cells, as :func:`linearise_source` sums them up; the x of all, then the
-    y. The last row of ``J`` is by the inverse depth."""
+    """Compute derivatives of some cells for :func:`linearise_source`: the x of all, then the y. The
+    last row of ``J`` is by the inverse depth."""
     huber, nearest = limits[0], limits[1]
     fx, fy, cx, cy, k1, k2 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     first, second = J[:, :_BLOCK], J[:, _BLOCK:]
@@ -80,7 +80,7 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
         a, b = (tx - tz * u) * q, (ty - tz * v) * q
         first[last, n], second[last, n] = xx * a + xy * b, yx * a + yy * b
         if shapes:
-            # A change of the lens moves the ray by a factor of (x, y, 0).
+            # A change of the lens moves the ray along (x, y, 0).
             z = motion[2, 0] * x + motion[2, 1] * y
             a = (motion[0, 0] * x + motion[0, 1] * y - z * u) * q
             b = (motion[1, 0] * x + motion[1, 1] * y - z * v) * q
@@ -108,14 +108,14 @@ def linearise_source(
     motions, rays, slopes, lens, inverse_depth, pixels, weight, further, limits,
     hessian, gradient, coupling, curvature, pull,
 ):  # fmt: skip
-    """Add the equations of all edges of a source to what is given.
+    """Add the equations of all edges of a source to the output arrays.
 
-    Unknowns are the motions to all targets (6e, left perturbations), then what all edges share: the
-    logarithm of the focal length, k1 and k2 where there are ``slopes`` (3, p) of the rays by them,
-    and those that move where cells fall by ``further`` (e, o, p, 2). ``limits`` are Huber's, in
-    deviations, and the least z. Filled are ``hessian`` (m, m) and ``gradient`` (m), the direction
-    of descent; ``coupling`` (m, p) with the inverse depths, whose own ``curvature`` (p), and
-    ``pull`` (p).
+    Unknowns are the motions to all targets (6e, left perturbations), then the shared ones: the
+    logarithm of the focal length, k1 and k2 if there are ``slopes`` (3, p) of the rays by them, and
+    those with derivatives ``further`` (e, o, p, 2) of the cells' positions. ``limits`` are the
+    Huber threshold, in deviations, and the least z. Outputs are ``hessian`` (m, m) and ``gradient``
+    (m), the direction of descent; ``coupling`` (m, p) with the inverse depths, and their
+    ``curvature`` (p) and gradient ``pull`` (p).
     """
     edges, cells = weight.shape[0], weight.shape[1]
     shapes, others = len(slopes), further.shape[1]
@@ -163,7 +163,7 @@ def linearise_source(
 
 @njit(**_FAST)
 def cost_of_source(motions, rays, lens, inverse_depth, pixels, weight, limits, behind):
-    """Huber's cost of all matched cells of a source; one behind its target costs ``behind``."""
+    """Return Huber's cost of a source's matched cells; ``behind`` is used behind their target."""
     knee, nearest = limits[0], limits[1]
     fx, fy, cx, cy, k1, k2 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     total = 0.0

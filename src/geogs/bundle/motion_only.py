@@ -1,4 +1,4 @@
-"""Motion-only adjustment on the CPU: poses of frames seen from keyframes that stay fixed."""
+"""Motion-only adjustment on the CPU: poses of frames relative to fixed keyframes."""
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +14,7 @@ from geogs.world.keyframes import Keyframe
 
 
 class MotionSolver:
-    """Finds poses of frames seen from fixed keyframes, on the CPU.
+    """Estimates poses of frames relative to fixed keyframes, on the CPU.
 
     Matches are those of some cells of a grid, or of all of them.
     """
@@ -26,7 +26,7 @@ class MotionSolver:
     def solve(
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-        """Poses, each adjusted on its own, and the residuals of the edges at those poses."""
+        """Adjust each pose separately; return the poses and the residuals of the edges at them."""
         camera, rays, d, frame = self.grid.camera, self.rays, problem.inverse_depth, problem.frame
         to_source = se3_inverse(problem.T_source)
 
@@ -40,7 +40,7 @@ class MotionSolver:
         def step(
             T: Float[Tensor, "n 4 4"], linear: tuple[Tensor, Tensor], damping: float
         ) -> Step[Tensor]:
-            """A pose whose step is not finite stays."""
+            """Take a step; a pose whose step is not finite does not change."""
             H, g = linear
             raised = damping * H.diagonal(dim1=-2, dim2=-1) + 1e-6
             xi = torch.linalg.solve(H + torch.diag_embed(raised), g)
@@ -59,14 +59,13 @@ class MotionSolver:
         huber: float,
         limit: float,
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
-        """Pose of a frame against one keyframe, and what says whether it is right.
+        """Fit the pose of a frame to one keyframe, with statistics for its acceptance.
 
         Cells without information do not count. Returns the pose; the motion from the keyframe to
-        it; and in one tensor the fraction of the cells that are matched, that whose residual is
-        below ``limit`` pixels, the medians over the matched of the residual, of the motion and of
-        its parallax (the motion from where the camera's rotation alone takes a cell), in pixels,
-        which are not numbers where nothing is matched, the fraction of the cells that have
-        information, and of those that are matched and have known depth
+        it; and in one tensor the fraction of matched cells, the fraction with a residual below
+        ``limit`` pixels, the medians over matched cells of residual, motion and parallax (motion
+        beyond the camera's rotation), in pixels and NaN without matches, the fraction of cells with
+        information, and the fraction of matched cells with known depth
         (``Keyframe.has_known_depth``). On a GPU all stays there, and nothing waits.
         """
         informed = keyframe.information > 0
@@ -93,6 +92,6 @@ class MotionSolver:
         return T[0], T_ji, torch.stack([matched, agreeing, *medians, known, placed_fraction])
 
     def _turned(self, T_ji: Float[Tensor, "4 4"]) -> Float[Tensor, "p 2"]:
-        """Where the cells fall if the camera only turns: those of points infinitely far away."""
+        """Project the cells by the camera's rotation alone, i.e. at infinite depth."""
         far = self.grid.pixels.new_zeros(1, len(self.rays))
         return project(self.grid.camera, self.rays, T_ji[None], far).pixels[0]

@@ -1,4 +1,4 @@
-"""The term of motions between frames that something else than the images has measured."""
+"""Term of motions between frames measured by another source than the images."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ from geogs.geometry.lie import se3_adjoint, se3_inverse, se3_left_jacobian, se3_
 from geogs.geometry.robust import cauchy_cost, cauchy_weight
 
 KNEE = 3.0
-"""Deviations (of all six numbers together) at which a motion counts half as much. What lies far
-beyond pulls less the farther it is, so that motions that are wrong altogether are out-voted."""
+"""Deviations (of all six numbers together) at which a motion counts half as much. Far beyond, the
+influence falls with distance, so that outliers are out-voted."""
 
 
 @dataclass(frozen=True)
@@ -24,23 +24,23 @@ class MeasuredMotions:
     source: Int[Tensor, "m"]
     target: Int[Tensor, "m"]
     T_ts: Float[Tensor, "m 4 4"]
-    """From the camera of the source to that of the target, float64."""
+    """Camera of the source to that of the target, float64."""
     information: Float[Tensor, "m 6"]
     """Inverse variances of translation and rotation (radians), in the target's axes."""
 
     def residual(self, T_cw: Float[Tensor, "n 4 4"]) -> Float[Tensor, "m 6"]:
-        """What is between the motions by the poses and the measured: Log(T_t T_s^-1 T_ts^-1)."""
+        """Return the difference of present and measured motions: Log(T_t T_s^-1 T_ts^-1)."""
         present = relative_motion(T_cw, self.source, self.target)
         return se3_log(present @ se3_inverse(self.T_ts))
 
     def robust_weight(self, residual: Float[Tensor, "m 6"]) -> Float[Tensor, "m"]:
-        """Cauchy's weight of each motion, ``KNEE`` deviations being one."""
+        """Return the Cauchy weight of each motion, with scale ``KNEE`` deviations."""
         return cauchy_weight((self.information * residual.square()).sum(-1) / KNEE**2)
 
     def equations(
         self, T_cw: Float[Tensor, "n 4 4"]
     ) -> tuple[Float[Tensor, "m 6 6"], Float[Tensor, "m 6 6"], Float[Tensor, "m 6"]]:
-        """Adjoints of the present motions; Hessian and gradient of a step of each.
+        """Return adjoints of the present motions; Hessian and gradient of a step of each.
 
         A step ``xi_rel = xi_t - Ad(T_ts) xi_s`` of the motion changes the residual e by
         ``Jl(e)^-1 xi_rel``.
@@ -56,7 +56,7 @@ class MeasuredMotions:
         return float(KNEE**2 * cauchy_cost(square / KNEE**2).sum())
 
     def hyper_edges(self, state: BundleState) -> list[HyperEdge]:
-        """One for each motion."""
+        """Return one hyper-edge for each motion."""
         ends = torch.stack([self.target, self.source], 1)
         parts = (ends, *self.equations(state.T_cw))
         return [

@@ -1,4 +1,4 @@
-"""What is adjusted: frames, what was matched along the edges between them, and other terms."""
+"""Adjustment problems: frames, matches along the edges between them, and other terms."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -10,33 +10,33 @@ from torch import Tensor
 from geogs.bundle.terms import BundleState, DepthTerm, PoseTerm
 
 Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]]
-"""Measured positions and their inverse variances for a slice of edges; asked from threads."""
+"""Returns measured positions and inverse variances for a slice of edges; called from threads."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Frames of one adjustment, and the terms beside its matches."""
+    """Frames of one adjustment, and its terms other than matches."""
 
     T_cw: Float[Tensor, "n 4 4"]
-    """float64."""
+    """World to camera, float64."""
     inverse_depth: Float[Tensor, "n p"]
     source: Int[Tensor, "e"]
-    """Source of each edge that is matched; edges are sorted by it."""
+    """Source of each matched edge; edges are sorted by it."""
     target: Int[Tensor, "e"]
     free_pose: Bool[Tensor, "n"]
     free_depth: Bool[Tensor, "n"]
-    """Only those of sources are adjusted."""
+    """Frames with free depth; only those of sources are adjusted."""
     depth_terms: tuple[DepthTerm, ...] = ()
-    """What is said of the depths of frames that are sources of edges."""
+    """Terms of the depths of frames that are sources of edges."""
     pose_terms: tuple[PoseTerm, ...] = ()
 
     @property
     def start(self) -> BundleState:
-        """Where the adjustment begins."""
+        """Initial state of the adjustment."""
         return BundleState(self.T_cw, self.inverse_depth)
 
     def joined(self) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
-        """Sources and targets of all that joins poses, sorted by source."""
+        """Return sources and targets of all edges and pose terms, sorted by source."""
         if not self.pose_terms:
             return self.source, self.target
         source = torch.cat([self.source, *(term.source for term in self.pose_terms)])
@@ -45,7 +45,7 @@ class Problem:
         return source[order], target[order]
 
     def known_before(self) -> Float[Tensor, "n p"]:
-        """Information of every inverse depth without its matches."""
+        """Return the information of every inverse depth without its matches."""
         known = torch.zeros_like(self.inverse_depth)
         for term in self.depth_terms:
             if term.information is not None:
@@ -55,9 +55,9 @@ class Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class BundleProblem(Problem):
-    """A problem whose matches are at hand.
+    """A problem whose matches are in memory.
 
-    On a GPU inverse depths, matches and terms of depths need to be there; all else is best on the
+    For a GPU, inverse depths, matches and depth terms have to be there; all else is best on the
     CPU.
     """
 
@@ -67,18 +67,18 @@ class BundleProblem(Problem):
     """Inverse variance of x and y, 1 / pixel^2."""
 
     def part(self, edges: slice) -> "BundleProblem":
-        """The same frames with some of the edges."""
+        """Return the same frames with some of the edges."""
         return _part(self, edges, self.pixels[edges], self.weight[edges])
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamedProblem(Problem):
-    """A problem whose matches are fetched when they are needed; all else is on the CPU."""
+    """A problem whose matches are fetched on demand; all else is on the CPU."""
 
     matches: Matches
 
     def part(self, edges: slice) -> BundleProblem:
-        """The same frames with some of the edges."""
+        """Return the same frames with some of the edges."""
         return _part(self, edges, *self.matches(edges))
 
 
@@ -92,22 +92,22 @@ def _part(
 
 @dataclass(frozen=True)
 class MotionProblem:
-    """Frames seen from keyframes that stay as they are; nothing joins two frames."""
+    """Frames seen from fixed keyframes, independent of each other."""
 
     T_cw: Float[Tensor, "n 4 4"]
-    """float64."""
+    """World to camera of the frames, float64."""
     inverse_depth: Float[Tensor, "e p"]
     """Inverse depths of the keyframe of each edge."""
     T_source: Float[Tensor, "e 4 4"]
     """World to the keyframe of each edge."""
     frame: Int[Tensor, "e"]
-    """Which of the frames an edge sees."""
+    """Frame of each edge."""
     pixels: Float[Tensor, "e p 2"]
     weight: Float[Tensor, "e p 2"]
 
 
 def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
-    """The sources of sorted edges and which edges are theirs."""
+    """Return the sources of sorted edges with their slices of edges."""
     frames, counts = torch.unique_consecutive(source, return_counts=True)
     found, start = [], 0
     for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
@@ -117,7 +117,7 @@ def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
 
 
 def source_chunks(source: Int[Tensor, "e"], size: int) -> list[slice]:
-    """Slices of about ``size`` edges that never split the edges of one source."""
+    """Return slices of about ``size`` edges that never split the edges of one source."""
     chunks, start, last = [], 0, 0
     for _, edges in sources_within(source):
         if edges.stop - start > size and last > start:

@@ -1,10 +1,10 @@
-"""Where the cells of source frames fall in their targets, and how that changes.
+"""Projection of source cells into target frames, and its derivatives.
 
 A cell with ray X and inverse depth d lies at y = R X + d t in the target, in units of its depth in
-the source, for T_ji = (R, t). What follows from y alone is here for every camera: the tracker's,
-which is here too, the lens with unknowns (:mod:`geogs.bundle.lens`) and the batch of cameras of the
-training. Each of them multiplies the same derivatives of a point by those of its own image, in an
-order of its own: one order for all would change the last bits of results.
+the source, for T_ji = (R, t). Functions of y alone are shared by all cameras: the tracker's, which
+is here too, the lens with unknowns (:mod:`geogs.bundle.lens`) and the batch of cameras of the
+training. Each of them multiplies the same derivatives of a point by those of its own image, in its
+own order: one order for all would change the last bits of results.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ from geogs.geometry.camera import LEAST_SLOPE, Camera
 from geogs.geometry.lie import se3_inverse
 
 MIN_Z = 0.05
-"""Points nearer than this fraction of the source's unit depth behind the target are ignored."""
+"""Least depth of a point in the target, over that in the source; nearer points are ignored."""
 INVERSE_DEPTHS = 1e-3, 1e2
-"""Least and largest inverse depth that an adjustment gives to a cell, per map unit."""
+"""Least and largest inverse depth of a cell after an adjustment, per map unit."""
 
 
 @dataclass(frozen=True)
 class CellProjection:
-    """Where the cells of the sources fall in the targets."""
+    """Positions of the sources' cells in the targets."""
 
     pixels: Float[Tensor, "*b e p 2"]
     valid: Bool[Tensor, "*b e p"]
-    """Whether a cell lies in front of the target."""
+    """Whether a cell is in front of the target."""
     z: Float[Tensor, "*b e p"]
     """Depth in the target over depth in the source, at least ``MIN_Z``."""
 
@@ -46,7 +46,7 @@ class LinearProjection(CellProjection):
 def relative_motion(
     T_cw: Float[Tensor, "*b n 4 4"], source: Int[Tensor, "e"], target: Int[Tensor, "e"]
 ) -> Float[Tensor, "*b e 4 4"]:
-    """T_ji = T_j T_i^-1 of every edge i -> j."""
+    """Return T_ji = T_j T_i^-1 of every edge i -> j."""
     return T_cw[..., target, :, :] @ se3_inverse(T_cw[..., source, :, :])
 
 
@@ -55,11 +55,11 @@ def seen_from_targets(
     T_ji: Float[Tensor, "*b e 4 4"],
     inverse_depth: Float[Tensor, "*b e p"],
 ) -> tuple[Float[Tensor, "*b e p 3"], Bool[Tensor, "*b e p"], Float[Tensor, "*b e p"]]:
-    """y = R ray + d t of every cell, whether it lies before the target, and its z.
+    """Return y = R ray + d t of every cell, whether it is in front of the target, and its z.
 
-    Points with a z below ``MIN_Z`` are flagged, and their z is set to that. In memory each
+    Points with a z below ``MIN_Z`` are flagged, and their z is clamped to it. In memory each
     coordinate of a target's cells is a row: many products of matrices with three columns take ten
-    times as long as one with as many as there are cells.
+    times as long as one with a column per cell.
     """
     R, t = T_ji[..., :3, :3].to(inverse_depth), T_ji[..., :3, 3:].to(inverse_depth)
     if rays.dim() == 2:
@@ -73,7 +73,7 @@ def seen_from_targets(
 def motion_rows(
     x: Float[Tensor, "*b p"], y: Float[Tensor, "*b p"], dq: Float[Tensor, "*b p"]
 ) -> tuple[Float[Tensor, "*b 6 p"], Float[Tensor, "*b 6 p"]]:
-    """d x / d xi and d y / d xi of points at (x, y, 1) / q, xi a left perturbation of T_ji.
+    """Return d x / d xi and d y / d xi of points at (x, y, 1) / q, xi a left perturbation of T_ji.
 
     ``dq`` is the inverse depth over z. Source: DROID-SLAM's reprojection layer.
     """
@@ -90,9 +90,9 @@ def project(
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
 ) -> CellProjection:
-    """Project the cells of source frames: where the camera shows y, of :func:`seen_from_targets`.
+    """Project the cells of source frames: pixels of y from :func:`seen_from_targets`.
 
-    What lies so far off the axis that radial terms fold it over is not valid.
+    Cells so far off the axis that radial terms fold them over are not valid.
     """
     y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
     if not camera.is_pinhole:
@@ -111,7 +111,7 @@ def linearise(
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
 ) -> LinearProjection:
-    """:func:`project` with the Jacobians in a left perturbation of T_ji and in d."""
+    """Do :func:`project` with the Jacobians in a left perturbation of T_ji and in d."""
     p = project(camera, rays, T_ji, inverse_depth)
     t, q = T_ji[:, :3, 3].to(inverse_depth), 1 / p.z
     plane = camera.plane(p.pixels)
@@ -136,9 +136,9 @@ def carried_over(
     at: CellProjection,
     step: Float[Tensor, "*b e p 2"],
 ) -> Float[Tensor, "*b e p 2"]:
-    """Small steps of the cells of source frames, in pixels of the targets, at constant depth.
+    """Propagate small steps of source cells to pixels of the targets, at constant depth.
 
-    To first order; ``at`` is where the cells fall by T_ji.
+    To first order; ``at`` is the projection of the cells by T_ji.
     """
     focal, plane = at.pixels.new_tensor([camera.fx, camera.fy]), camera.plane(at.pixels)
     step = step / focal
@@ -146,7 +146,7 @@ def carried_over(
         xx, xy, yy = camera.bend_jacobian(rays[:, :2])
         x, y = step.unbind(-1)
         step = torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / (xx * yy - xy * xy)[:, None]
-    moved = (T_ji[:, :3, :2].to(step) @ step.mT).mT  # as :func:`seen_from_targets` does
+    moved = (T_ji[:, :3, :2].to(step) @ step.mT).mT  # as in :func:`seen_from_targets`
     off = moved[..., :2] - plane * moved[..., 2:]
     if not camera.is_pinhole:
         xx, xy, yy = camera.bend_jacobian(plane)

@@ -1,7 +1,7 @@
-"""How far matches contradict a rigid scene, cell by cell, the poses being as they are.
+"""Residuals of matches that contradict a rigid scene, cell by cell, at given poses.
 
-A cell's depth takes up whatever lies along its epipolar lines, so each cell is first given the
-depth that suits all of its own matches best; what is left of them no depth explains.
+A cell's depth absorbs errors along its epipolar lines. So each cell first gets the depth that fits
+all of its own matches best; no depth explains the remaining residuals.
 """
 
 import torch
@@ -14,7 +14,7 @@ from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.robust import huber_weight
 
 BEHIND = 100.0
-"""Residual of a match, in its deviations, whose cell would lie behind the target."""
+"""Residual, in deviations, of a match whose cell would be behind the target."""
 
 
 def best_residuals(
@@ -29,23 +29,23 @@ def best_residuals(
     huber: float = 0.5,
     iterations: int = 3,
 ) -> Float[Tensor, "e p"]:
-    """Residuals of all matches in their deviations, each cell at the depth that suits it best.
+    """Compute residuals of all matches in their deviations, each cell at its best depth.
 
     Args:
         camera: of the frames.
         rays: of the cells.
-        T_cw: poses, which stay; float64, on any device.
-        inverse_depth: where the search for each cell's depth begins.
-        source: frame whose cells an edge matches.
-        target: frame in which they are found.
+        T_cw: poses, fixed; float64, on any device.
+        inverse_depth: initial depth of each cell.
+        source: frame of the matched cells of an edge.
+        target: frame of their matches.
         pixels: position in the target of every cell of the source.
         weight: inverse variance of x and y, 1 / pixel^2; 0 where there is no match.
-        huber: standard deviations beyond which a residual counts linearly.
+        huber: Huber threshold in standard deviations.
         iterations: damped Gauss-Newton steps.
 
     Returns 0 where there is no match.
     """
-    if not camera.is_pinhole:  # as a pinhole would have seen them
+    if not camera.is_pinhole:  # convert to a pinhole
         plane, focal = camera.plane(pixels), pixels.new_tensor([camera.fx, camera.fy])
         pixels = plane * focal + pixels.new_tensor([camera.cx, camera.cy])
     if inverse_depth.is_cuda:
@@ -58,14 +58,14 @@ def best_residuals(
         )  # fmt: skip
     T_ji = relative_motion(T_cw, source, target).to(inverse_depth)
     source = source.to(inverse_depth.device)
-    # Axis by axis, in units of the focal lengths: far faster than pairs of numbers.
+    # Axis by axis, in units of the focal lengths: far faster than on pairs of numbers.
     ax, ay, az = (rays @ T_ji[:, :3, :3].mT).permute(2, 0, 1).contiguous()
     tx, ty, tz = T_ji[:, :3, 3].T[..., None]
     wx, wy = weight[..., 0] * camera.fx**2, weight[..., 1] * camera.fy**2
     ux, uy = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
 
     def projected(d: Float[Tensor, "n p"]) -> tuple[Tensor, ...]:
-        """Where cells are seen, the inverse of z, whether they are in front, and residuals."""
+        """Return projections of cells, 1 / z, whether they are in front, and residuals."""
         along = d[source]
         z = az + along * tz
         valid, q = z > MIN_Z, 1 / z.clamp(min=MIN_Z)

@@ -1,11 +1,11 @@
-"""A rolling shutter in an adjustment: how the camera moves while it reads each frame.
+"""A rolling shutter in an adjustment: motion of the camera while it reads each frame.
 
-Row by row a frame is seen from other places. To first order in the readout r, a point that a
+Each row of a frame is seen from another position. To first order in the readout r, a point that a
 pinhole with the pose of the middle row would show at p is seen at p + r t v: t is the time of its
 row, in readouts from the middle one, and v the velocity of the point in the image, which follows
-from the twist of the camera and the depth. Twists are those by which what is seen moves from the
-frame to its neighbours in the video (:func:`fitted_twists`), so that the readout is one unknown, of
-which the residuals are linear.
+from the twist of the camera and the depth. Twists are fitted to the image motion from the frame to
+its neighbours in the video (:func:`fitted_twists`), so that the readout is one unknown, in which
+the residuals are linear.
 Source: differential rolling-shutter geometry (Zhuang, Cheong, Lee 2017), in the adjustment.
 """
 
@@ -22,12 +22,12 @@ from geogs.geometry.robust import geman_mcclure_weight
 ROUNDS = 8
 """Reweighted steps of the fit of a twist."""
 OFF = 0.15
-"""Pixels per pixel that what is seen moves by, and pixels, from which on a cell hardly counts."""
+"""Scale of the robust weights as a fraction of the mean image motion; at least one pixel / s."""
 
 
 @dataclass(frozen=True)
 class RowTimes:
-    """When pixels are seen, in readouts from the middle of the image: linear in either axis."""
+    """Times of pixels, in readouts from the middle of the image: linear in either axis."""
 
     per_column: float
     per_row: float
@@ -35,7 +35,7 @@ class RowTimes:
     """Time of the pixel (0, 0)."""
 
     def of(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
-        """Times of pixels."""
+        """Return the times of pixels."""
         return self.per_column * pixels[..., 0] + self.per_row * pixels[..., 1] + self.first
 
 
@@ -44,7 +44,7 @@ class RowMotions:
     """Twists of frames while their rows are read."""
 
     twist: Float[Tensor, "n 6"]
-    """Per second: a left perturbation of each frame's pose."""
+    """Twist per second: a left perturbation of each frame's pose."""
     times: RowTimes
 
     def slopes(
@@ -56,9 +56,9 @@ class RowMotions:
         source: Int[Tensor, "e"],
         target: Int[Tensor, "e"],
     ) -> Float[Tensor, "e p 2"]:
-        """Moves of where the cells of sources are found in targets by a readout of a second.
+        """Return derivatives of the source cells' positions in targets by the readout in seconds.
 
-        Where a target's row shows a point, less where the source's row had it, carried over at its
+        The shift by the target's row, less that by the source's row, propagated at the cell's
         depth; both as steps of x / z and y / z.
         """
         depth = inverse_depth[source]
@@ -84,7 +84,7 @@ def fitted_twists(
     velocity: Float[Tensor, "n p 2"],
     known: Bool[Tensor, "n p"],
 ) -> Float[Tensor, "n 6"]:
-    """Twists of cameras per second by which the cells of each frame move in its image.
+    """Fit twists of cameras, per second, to the velocities of each frame's cells.
 
     By iteratively reweighted least squares. Zero where nothing is known.
 
@@ -92,8 +92,8 @@ def fitted_twists(
         camera: of the frames.
         rays: of the cells.
         inverse_depth: of the cells of each frame.
-        velocity: pixels per second of what the cells show.
-        known: which of the velocities and depths are known.
+        velocity: of the cells, pixels per second.
+        known: whether velocity and depth of each cell are known.
     """
     J = _motions(camera, rays, inverse_depth).double().flatten(2)
     v, weight = velocity.double().mT.flatten(1), known.double()
@@ -115,7 +115,7 @@ def _plane_velocity(
     inverse_depth: Float[Tensor, "*c p"],
     twist: Float[Tensor, "n 6 1"],
 ) -> Float[Tensor, "n p 2"]:
-    """Velocities of x / z and y / z of points by the twists of their cameras."""
+    """Return velocities of x / z and y / z of points by the twists of their cameras."""
     x, y = plane.unbind(-1)
     vx, vy, vz, wx, wy, wz = twist.unbind(1)
     across, along = y * wx - x * wy, inverse_depth * vz
@@ -127,6 +127,6 @@ def _plane_velocity(
 def _motions(
     camera: Camera, rays: Float[Tensor, "p 3"], inverse_depth: Float[Tensor, "n p"]
 ) -> Float[Tensor, "n 6 2 p"]:
-    """Derivatives of the pixels of what cells show by the twist of their camera."""
+    """Return derivatives of the cells' pixels by the twist of their camera."""
     still = torch.eye(4, dtype=torch.float64).expand(len(inverse_depth), 4, 4)
     return linearise(camera, rays, still, inverse_depth).pose_jacobian

@@ -1,6 +1,6 @@
-"""Poses and inverse depths as the least-squares loop sees them, whoever linearises.
+"""Adjustment of poses and inverse depths by the least-squares loop; base of all solvers.
 
-Depths are eliminated source by source (Schur complement), the camera system that is left is solved,
+Depths are eliminated source by source (Schur complement), the remaining camera system is solved,
 and the depths follow. Solvers differ in what they keep of linearised matches, and where.
 """
 
@@ -23,39 +23,40 @@ L = TypeVar("L")
 
 
 class SchurBundle(ABC, Generic[P, L]):
-    """One adjustment; ``L`` is what is kept of a linearised problem."""
+    """One adjustment; ``L``: type of a linearised problem."""
 
     def __init__(self, problem: P, options: BundleOptions) -> None:
         self.problem, self.options = problem, options
         self.information = problem.known_before()
-        """Information of every inverse depth, where the problem was linearised last."""
+        """Information of every inverse depth at the last linearisation."""
 
     @abstractmethod
     def linearise(self, state: BundleState) -> L:
-        """The camera system, and what the depths are found by."""
+        """Return the camera system, and the data for the depth steps."""
 
     @abstractmethod
     def solve_cameras(self, linear: L, damping: float) -> Float[Tensor, "v"] | None:
-        """Steps of all poses, zero for the fixed, then of shared unknowns; None if not finite."""
+        """Solve for steps of all poses, zero for fixed ones, then of shared unknowns; None if not
+        finite."""
 
     @abstractmethod
     def depth_steps(
         self, state: BundleState, linear: L, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """Steps of the free inverse depths that go with that of all else."""
+        """Return steps of the free inverse depths, given the step of all others."""
 
     @abstractmethod
     def flow_cost(self, state: BundleState) -> float:
-        """Twice what is minimised of the matches."""
+        """Return the cost of the matches (twice their objective)."""
 
     def cost(self, state: BundleState, linear: L | None = None) -> float:
-        """Twice what is minimised, in variances of the measurements."""
+        """Return the cost (twice the objective), in variances of the measurements."""
         terms = sum(term.cost(state) for term in self.problem.depth_terms)
         terms += sum(term.cost(state) for term in self.problem.pose_terms)
         return self.flow_cost(state) + terms
 
     def step(self, state: BundleState, linear: L, damping: float) -> Step[BundleState] | None:
-        """The step of all unknowns; None where it is not finite."""
+        """Compute the step of all unknowns; None where it is not finite."""
         step = self.solve_cameras(linear, damping)
         if step is None:
             return None
@@ -70,7 +71,7 @@ class SchurBundle(ABC, Generic[P, L]):
         return Step(BundleState(T, d, block), float(xi.abs().max()))
 
     def adjusted(self) -> BundleResult:
-        """Steps from where the problem begins."""
+        """Run the adjustment from the initial state."""
         o = self.options
         cost = self.cost if o.lowers_cost else None
         solution = minimise(self.problem.start, self.linearise, self.step, o.policy, cost)
@@ -79,6 +80,6 @@ class SchurBundle(ABC, Generic[P, L]):
 
 
 def stepped_depths(problem: Problem, moved: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-    """Moved inverse depths within their range, where they are free; the problem's own elsewhere."""
+    """Clamp free inverse depths after a step to their range; keep the problem's own elsewhere."""
     free = problem.free_depth[:, None].to(moved.device)
     return torch.where(free, moved.clamp(*INVERSE_DEPTHS), problem.inverse_depth)

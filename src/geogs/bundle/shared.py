@@ -1,9 +1,9 @@
-"""Bundle adjustment with unknowns that all edges share: a lens, and the readout of a shutter.
+"""Bundle adjustment with shared unknowns: a lens, and the readout of a shutter.
 
-Levenberg-Marquardt on the tracker's cost (:mod:`geogs.bundle.dense`) with a block of unknowns
-beside poses and inverse depths: depths are eliminated frame by frame, then poses and block are
-solved together in float64. The first pose is fixed; the scale, which nothing measures, is kept by a
-penalty along it, so that nothing else resists the block.
+Levenberg-Marquardt on the tracker's cost (:mod:`geogs.bundle.dense`) with a block of unknowns in
+addition to poses and inverse depths: depths are eliminated frame by frame, then poses and block are
+solved together in float64. The first pose is fixed; the scale, which is not measured, is fixed by a
+penalty along it, so that nothing else constrains the block.
 
 All of it is on the CPU, where matches are linearised by compiled loops
 (:mod:`geogs.bundle.lens_flow`).
@@ -29,20 +29,20 @@ from geogs.geometry.least_squares import Policy, minimise
 from geogs.geometry.lie import se3_inverse
 
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
-"""How shared unknowns are adjusted; the iterations are linearisations at most."""
+"""Options for shared unknowns; the iterations are the most linearisations."""
 LARGEST_STEP = 0.3
-"""Most that an unknown of the lens moves by at once."""
+"""Largest step of an unknown of the lens."""
 LEAST_DECREASE = 1e-4
-"""Fraction of the cost; a step that lowers it by no more is the last one."""
+"""Relative decrease of the cost below which a step is the last one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedResult(BundleResult):
-    """The adjusted problem, and how well the block is known."""
+    """The adjusted problem, and the covariance of the block."""
 
     block: LensBlock
     cost: float
-    """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
+    """Mean Huber cost of a residual over the matched cells, in variances of a match."""
     covariance: Float[Tensor, "m m"]
     """Covariance of the block's unknowns, zero for those that are no variables; see
     :func:`solve_shared`."""
@@ -56,11 +56,11 @@ def solve_shared(
 ) -> SharedResult:
     """Adjust all free poses, all inverse depths and the block; every frame's depth is free.
 
-    The covariance is ``S^-1``, as if matches erred independently, and beside it the cluster-robust
-    one (Liang and Zeger's sandwich), ``S^-1 (sum_i g_i g_i^T) S^-1`` with the reduced gradient
-    ``g_i`` of each source frame, since the errors of neighbouring cells, and of one cell in several
-    targets, are alike. Where hardly anything tells, as of a camera that never turns, the few
-    gradients agree by chance. A step that is not finite ends the adjustment.
+    The covariance is ``S^-1``, as for independent errors of matches, plus the cluster-robust one
+    (Liang and Zeger's sandwich), ``S^-1 (sum_i g_i g_i^T) S^-1`` with the reduced gradient ``g_i``
+    of each source frame, since the errors of neighbouring cells, and of one cell in several
+    targets, are correlated. Where there is hardly any evidence, as for a camera that never rotates,
+    the few gradients agree by chance. A non-finite step ends the adjustment.
     """
     shared = SharedSchur(problem, options)
     start = BundleState(problem.T_cw, problem.inverse_depth, block)
@@ -86,7 +86,7 @@ def solve_shared(
 
 
 class SharedSchur(DenseSchur):
-    """One adjustment with shared unknowns that projections depend on."""
+    """One adjustment with shared unknowns of the projection."""
 
     floor = 1e-6
 
@@ -94,7 +94,7 @@ class SharedSchur(DenseSchur):
         super().__init__(problem, LensFlow(), options)
 
     def linearise(self, state: BundleState) -> LinearBundle:
-        """The problem with a penalty that keeps the scale."""
+        """Linearise the problem, with a penalty that fixes the scale."""
         linear = super().linearise(state)
         system, T = linear.system, state.T_cw
         diagonal = torch.zeros_like(system.gradient)
@@ -110,21 +110,21 @@ class SharedSchur(DenseSchur):
         return linear
 
     def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
-        """The solution with the step of the lens cut to ``LARGEST_STEP``."""
+        """Solve, with the step of the lens clamped to ``LARGEST_STEP``."""
         step = super().solve_cameras(linear, damping)
         if step is not None:
             step[6 * linear.system.frames :].clamp_(-LARGEST_STEP, LARGEST_STEP)
         return step
 
     def cost(self, state: BundleState, linear: LinearBundle | None = None) -> float:
-        """Mean over the matched cells; infinite where nothing is matched."""
+        """Return the mean cost over the matched cells; infinite without any."""
         matched = int((self.problem.weight[..., 0] > 0).sum())
         return super().cost(state) / matched if matched else math.inf
 
 
 def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
-    """Median residual of the matches in front of their targets, in their own deviations, where a
-    problem was adjusted."""
+    """Return the median residual, in own deviations, of the matches in front of their targets, for
+    an adjusted problem."""
     source, depth = problem.source, result.inverse_depth[problem.source]
     T_ji, block = relative_motion(result.T_cw, source, problem.target), result.block
     at = block.project(result.T_cw, source, problem.target, depth)
@@ -134,7 +134,7 @@ def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
 
 
 def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:
-    """Covariance of the block's unknowns, see :func:`solve_shared`."""
+    """Compute the covariance of the block's unknowns, see :func:`solve_shared`."""
     system, sources = linear.system, linear.sources
     H, free, first = system.hessian, system.free, 6 * system.frames
     out = H.new_zeros(len(H) - first, len(H) - first)

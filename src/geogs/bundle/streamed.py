@@ -1,8 +1,8 @@
 """Dense bundle adjustment of problems whose linearised edges would not fit into memory.
 
-The same steps as ``DenseBundle``. Matches are fetched and linearised some edges at a time, what
-they say of the camera system is added up, and nothing of them is kept; once the poses are known,
-the edges are projected a second time for the steps of the inverse depths.
+The same steps as ``DenseBundle``. Matches are fetched and linearised some edges at a time, added to
+the camera system, and not kept; once the poses are known, the edges are linearised a second time
+for the steps of the inverse depths.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +28,7 @@ R = TypeVar("R")
 
 
 class StreamedBundle:
-    """Solver for one grid on the CPU; memory grows with the frames and the blocks they span."""
+    """Solver for one grid on the CPU; memory grows with the number of frames and of blocks."""
 
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
@@ -38,7 +38,7 @@ class StreamedBundle:
 
 
 class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
-    """One adjustment that keeps nothing but the camera system of what it linearises."""
+    """One adjustment that only keeps the camera system of linearised edges."""
 
     def __init__(self, problem: StreamedProblem, grid: SampleGrid, options: BundleOptions) -> None:
         super().__init__(problem, options)
@@ -47,7 +47,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         self.chunks: Sequence[slice] = source_chunks(problem.source, options.chunk)
 
     def linearise(self, state: BundleState) -> SparseCameraSystem:
-        """Chunk by chunk, several side by side."""
+        """Linearise chunk by chunk, several in parallel."""
         self.system.clear()
         self.add_matches(state)
         for term in self.problem.pose_terms:
@@ -55,12 +55,12 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return self.system
 
     def add_matches(self, state: BundleState) -> None:
-        """Add what matches and other terms of depths say of the poses to the camera system."""
+        """Add matches and depth terms, with depths eliminated, to the camera system."""
 
         def work(chunk: slice) -> list[SourceFlow]:
             part = self.problem.part(chunk)
             sources = linearised_sources(self.flow, part, state, self.options)
-            # The coupling with the depths is most of it, and not needed again.
+            # The coupling with the depths is large, and not needed again.
             return [replace(s, edges=s.edges.without_coupling()) for s in sources]
 
         for sources in _few_at_a_time(work, self.chunks):
@@ -69,7 +69,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
                 self.information[source.frame] = source.information
 
     def flow_cost(self, state: BundleState) -> float:
-        """Chunk by chunk, several side by side."""
+        """Compute the cost chunk by chunk, several in parallel."""
 
         def work(chunk: slice) -> float:
             return self.flow.cost(self.problem.part(chunk), state, self.options.huber)
@@ -77,13 +77,13 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return sum(_few_at_a_time(work, self.chunks))
 
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
-        """The solution by the Cholesky factor of a band."""
+        """Solve by the Cholesky factor of a band."""
         return linear.solve(damping, FLOOR)
 
     def depth_steps(
         self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """The depths that follow by matches that are linearised a second time."""
+        """Compute the depth steps from matches linearised a second time."""
 
         def work(chunk: slice) -> list[tuple[int, Tensor]]:
             part, frames, found = self.problem.part(chunk), len(state.T_cw), []
@@ -103,7 +103,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
 
 
 def _few_at_a_time(work: Callable[[slice], R], chunks: Sequence[slice]) -> Iterator[R]:
-    """Results in order, worked on side by side, a few of them kept at a time."""
+    """Yield results in order, computed in parallel, a few of them kept at a time."""
     group = 8 * worker_count()
     for start in range(0, len(chunks), group):
         yield from thread_map(work, chunks[start : start + group])

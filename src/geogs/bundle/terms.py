@@ -1,11 +1,11 @@
-"""The terms of an adjustment: what a kind of measurement says of the unknowns.
+"""Terms of an adjustment: one for each kind of measurement.
 
-To add a kind of measurement, write a term in a file of its own and enter it where the problem is
-made (``FrameGraph.streamed_problem``). A ``DepthTerm`` says something of single inverse depths, a
-``PoseTerm`` of poses. Dense flow, which every problem has, is :mod:`geogs.bundle.flow_term`.
+To add a kind of measurement, write a term in a file of its own and add it where the problem is made
+(``FrameGraph.streamed_problem``). A ``DepthTerm`` constrains single inverse depths, a ``PoseTerm``
+poses. Dense flow, which every problem has, is :mod:`geogs.bundle.flow_term`.
 
-The CPU's solvers take any term; the GPU's any term of poses, and those of depths that they have a
-kernel for (:mod:`geogs.bundle.cuda.depth_terms`).
+CPU solvers accept any term; GPU solvers any pose term, and the depth terms for which they have a
+kernel (:mod:`geogs.bundle.cuda.depth_terms`).
 """
 
 from collections.abc import Sequence
@@ -21,13 +21,13 @@ from geogs.bundle.lens import LensBlock
 
 @dataclass(frozen=True)
 class BundleState:
-    """What is adjusted, at its present values."""
+    """Present values of the unknowns."""
 
     T_cw: Float[Tensor, "n 4 4"]
     """World to camera of each frame, float64."""
     inverse_depth: Float[Tensor, "n p"]
     block: LensBlock | None = None
-    """The lens, where it is adjusted along with them."""
+    """The lens, if it is adjusted, too."""
 
 
 @runtime_checkable
@@ -36,36 +36,36 @@ class DepthTerm(Protocol):
 
     @property
     def information(self) -> Float[Tensor, "n p"] | None:
-        """Inverse variances of what it measures on its own, if it does."""
+        """Inverse variances of its own measurements, if any."""
         ...
 
     def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
-        """The residuals of a frame linearised."""
+        """Linearise the residuals of a frame."""
         ...
 
     def cost(self, state: BundleState) -> float:
-        """Twice what is minimised of all frames: their squared residuals, as far as they count."""
+        """Return the cost of all frames (twice the objective): robust squared residuals."""
         ...
 
 
 @runtime_checkable
 class PoseTerm(Protocol):
-    """Residuals of poses, beside any depth; all of it is on the CPU."""
+    """Residuals of poses, without depths; always on the CPU."""
 
     @property
     def source(self) -> Int[Tensor, "m"]:
-        """With ``target``: which frames it joins."""
+        """Source frame of each residual."""
         ...
 
     @property
     def target(self) -> Int[Tensor, "m"]:
-        """With ``source``: which frames it joins."""
+        """Target frame of each residual."""
         ...
 
     def hyper_edges(self, state: BundleState) -> Sequence[HyperEdge]:
-        """The residuals linearised."""
+        """Linearise the residuals."""
         ...
 
     def cost(self, state: BundleState) -> float:
-        """Twice what is minimised: the squared residuals, as far as they count."""
+        """Return the cost (twice the objective): robust squared residuals."""
         ...

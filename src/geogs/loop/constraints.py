@@ -144,7 +144,7 @@ def between_positions(relative: RelativePoses, ids: Sequence[int]) -> RelativePo
 
 
 def rescaled(relative: RelativePoses, scale: Mapping[int, float]) -> RelativePoses:
-    """Return relative poses between ids after the unit of each keyframe was divided by its scale."""
+    """Rescale relative poses between ids after each keyframe's unit was divided by its scale."""
     if not scale or not len(relative):
         return relative
     ids = sorted(scale)

@@ -177,7 +177,7 @@ class LoopDetector:
         return {k: (s.inverse_depth, s.information) for k, s in states.items()}
 
     def _facing(self, id: int) -> list[int]:
-        """Return the nearest earlier keyframes with a similar viewing direction; a limited number."""
+        """Return a few nearest earlier keyframes with a similar viewing direction."""
         segment = self.keyframes.set_of[id]
         old = np.array(self.table.keyframes[: self._first_near(id)], np.int64)
         depth = 1 / float(segment[id].inverse_depth.median())

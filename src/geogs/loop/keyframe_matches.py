@@ -43,7 +43,7 @@ the steps end long before it is corrected (docs/adjustment.md)."""
 
 Measured = Mapping[Pair, PackedEdge]
 Shifts = Callable[[list[Pair]], Float[Tensor, "e p 2"]]
-"""Function returning the correction, in pixels, of the matches of some edges at the present state."""
+"""Returns the correction, in pixels, of the matches of some edges, by present poses and depths."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class KeyframeMatches:
 
 
 def global_pairs(tracker: Tracker) -> list[Pair]:
-    """Return pairs of neighbours in time and of revisits, thinned evenly; not within a saved map."""
+    """Return pairs of neighbours in time and of revisits, thinned; not within a saved map."""
     grid, ids = tracker.keyframes.grid, tracker.segment.ids
     pairs = proximity_pairs(
         tracker.keyframes,

@@ -4,7 +4,7 @@ A keyframe's similarity S takes the world to its camera in the keyframe's own un
 cell of keyframe i with ray X and inverse depth d lies at Y = s R X + d t in keyframe j, with
 ``(s R, t) = S_j S_i^-1``, and is seen at pi(K Y). Projection ignores scale, so an edge is
 linearised in the six numbers [tau, phi] of the relative similarity; the chain to both keyframes,
-``xi_rel = xi_j - Ad(S_ji) xi_i``, carries the scale of the source.
+``xi_rel = xi_j - Ad(S_ji) xi_i``, includes the scale of the source.
 """
 
 from dataclasses import dataclass, replace
@@ -136,7 +136,7 @@ class LinearMatches:
     """Cells in front of their target; only these count."""
 
     def equations(self, damping: float) -> BlockEquations:
-        """Return equations over the keyframes; depths are damped relative to their curvature, too."""
+        """Return equations over the keyframes; depths are damped by their curvature, too."""
         index = torch.zeros(0, dtype=torch.long)
         gradient = torch.zeros(self.keyframes, 7, dtype=torch.float64)
         rows, columns, blocks = [index], [index], [gradient.new_zeros(0, 7, 7)]

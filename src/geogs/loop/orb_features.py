@@ -7,7 +7,7 @@ from jaxtyping import Bool, UInt8
 from geogs.world.loops import ImageFeatures
 
 FEATURES = 800
-"""Most features of a keyframe, strongest of each image cell first; plain walls have a few hundred."""
+"""Most features of a keyframe, strongest of each cell first; plain walls have a few hundred."""
 FAST_THRESHOLD = 7
 """Least grey-level step of a corner: low, so that dark exposures still give features."""
 ROWS, COLUMNS = 6, 8
@@ -45,7 +45,7 @@ def orb_features(
 
 
 def _spread(pixels: np.ndarray, strength: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an order with the strongest of every cell first, then the second of every cell, etc."""
+    """Order features: the strongest of every cell, then the second of every cell, and so on."""
     row = (pixels[:, 1] * ROWS / shape[0]).astype(int)
     cell = row * COLUMNS + (pixels[:, 0] * COLUMNS / shape[1]).astype(int)
     by_cell = np.lexsort((-strength, cell))

@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from geogs.world.loops import ImageFeatures, Vocabulary
 
 INDEXED = 300
-"""Features of an image that are looked up and stored, strongest first; the rest are for matching."""
+"""Features of an image looked up and stored, strongest first; the rest only serve verification."""
 WORD_RADIUS = 50
 """Bits (of 256) within which a descriptor belongs to an existing word."""
 WORDS = 6144

@@ -85,7 +85,7 @@ class PlaceRecognition:
         self.index.add(id, self.table.features[id])
 
     def find(self, query: Query) -> None:
-        """Index a keyframe, and store its candidate pairs with earlier ones, most promising first."""
+        """Index a keyframe, and store its candidate pairs, most promising first."""
         id = query.id
         self.table.features[id] = query.features.result()
         candidates = self._candidates(query)
@@ -115,8 +115,7 @@ class PlaceRecognition:
         )
 
     def _candidates(self, query: Query) -> list[LoopCandidate]:
-        """Return pairs of a keyframe with earlier ones, thinned, by geometry and appearance in turn.
-        """
+        """Return thinned pairs of a keyframe with earlier ones, by poses and appearance in turn."""
         id, by_pose = query.id, query.by_pose
         by_appearance = self._similar(self.table.features[id], query.near)
         alternating: list[LoopCandidate] = []

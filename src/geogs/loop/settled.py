@@ -10,7 +10,7 @@ from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import RelativePoses
 
 REACH = 8
-"""Distance in keyframes, summed over both ends, from a settled pair within which others are settled,
+"""Distance in keyframes, summed over both ends, within which pairs near a settled one are settled,
 too: the drift between them is a small part of that between its ends."""
 RECENT = 64
 """Number of latest keyframes considered as later ends: more than are ever searched."""

@@ -217,7 +217,7 @@ class Tracker:
             self._orientation.located(self.segment.status.orientation, frame, encoded)
             self._choice.see(frame.image)
         self.segment.status.last = follower.last
-        self._motion = None  # by which a frame was located at what the keyframe was
+        self._motion = None  # it belongs to the keyframe before its completion
 
     def complete(self) -> TrackResult:
         """Complete the new keyframe: neighbours, depth, local adjustment."""

@@ -51,7 +51,7 @@ class Archive:
         self._withheld: list[tuple[int, int]] = []
         """Offset and size of unreferenced arrays that the last checkpoint still needs."""
         self._releasing: list[tuple[int, int]] = []
-        """Those that the checkpoint being written does not need, either."""
+        """The same, but not needed by the checkpoint being written, either."""
         try:
             self._file = tempfile.TemporaryFile(dir=self.folder, buffering=0)  # noqa: SIM115
         except OSError as error:

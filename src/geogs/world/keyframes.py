@@ -296,7 +296,7 @@ class KeyframeSet:
     """Keyframes of a table whose poses share a gauge (world and unit); in order of time."""
 
     members: list[KeyframeId] = field(default_factory=list)
-    """Their ids, earliest first."""
+    """Ids of the keyframes, earliest first."""
     table: KeyframeTable = field(init=False, repr=False, metadata=NOT_STORED)
     _corrections: list[PoseCorrection] = field(
         default_factory=list, init=False, repr=False, metadata=NOT_STORED

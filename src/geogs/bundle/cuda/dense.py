@@ -31,14 +31,14 @@ TILE = 32
 
 @dataclass(frozen=True)
 class _Structure:
-    """Which frames and edges there are and how they meet, as index arrays on the device."""
+    """Structure of frames and edges, as index arrays on the device."""
 
     poses: int
     """Number of free poses."""
     edges: EdgeArrays
-    """All frames may be sources."""
+    """Edges; all frames may be sources."""
     slot: Tensor
-    """Place of each frame in the camera system, -1 where its pose is fixed."""
+    """Slot of each frame in the camera system, -1 where its pose is fixed."""
     places: Tensor
     """Blocks of the camera system, see ``assemble_system``."""
     first_part: Tensor
@@ -50,7 +50,7 @@ class _Structure:
 
 
 def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
-    """The index arrays, sent to the device in one piece."""
+    """Build the index arrays, copied to the device at once."""
     source, target, free_pose, free_depth = (
         x.cpu().numpy()
         for x in (problem.source, problem.target, problem.free_pose, problem.free_depth)
@@ -72,10 +72,10 @@ def _system_parts(
     same: Bool[np.ndarray, "k"],
     poses: int,
 ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m1"], Int[np.ndarray, "l"]]:
-    """What each block of the camera system is the sum of: places, first parts, parts.
+    """Return the parts summed in each block of the camera system: places, first parts, parts.
 
-    Given are the slots of the frames of every pair of edges. A pair of two edges stands for its
-    mirror image as well.
+    Arguments are the slots of the frames of every pair of edges. A pair of two edges represents its
+    mirror image, too.
     """
     row = np.concatenate([target_a, target_a, source, source])
     column = np.concatenate([target_b, source, target_b, source])
@@ -91,7 +91,7 @@ def _system_parts(
     found = np.concatenate([row[lower] * (poses + 1) + column[lower], right * (poses + 1) + poses])
     part = np.concatenate([part[lower], vector])
     order = np.argsort(found, kind="stable")
-    # Every place is listed, so that those without parts are set to zero.
+    # Every block is listed, so that those without parts are set to zero.
     p, q = np.tril_indices(poses)
     places = np.concatenate([p * (poses + 1) + q, np.arange(poses) * (poses + 1) + poses])
     places.sort()
@@ -101,15 +101,15 @@ def _system_parts(
 
 @dataclass(frozen=True)
 class _State:
-    """What is adjusted, on the device."""
+    """Unknowns on the device."""
 
     memory: Float[Tensor, "m"]
-    """Poses and the sign of failure, which travel back together."""
+    """Poses and the failure flag, which are copied back together."""
     inverse_depth: Float[Tensor, "n p"]
 
     @staticmethod
     def at_start(problem: BundleProblem) -> "_State":
-        """Where the adjustment begins."""
+        """Return the initial state of the adjustment."""
         d, T = problem.inverse_depth, problem.T_cw
         memory = torch.zeros(T.numel() + 1, dtype=torch.float64, device=d.device)
         memory[:-1].copy_(to_device(T.reshape(-1), d.device))
@@ -117,26 +117,26 @@ class _State:
 
     @property
     def T(self) -> Float[Tensor, "m"]:
-        """Poses."""
+        """Poses, flattened."""
         return self.memory[:-1]
 
     @property
     def failed(self) -> Int[Tensor, "2"]:
-        """Not zero once a step was not finite."""
+        """Failure flag: not zero once a step was not finite."""
         return self.memory[-1:].view(torch.int32)
 
     @property
     def everything(self) -> BundleState:
-        """The state that terms are given."""
+        """State for the terms."""
         return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth)
 
     @property
     def with_poses_here(self) -> BundleState:
-        """The state that terms of poses are given; waits."""
+        """State for pose terms, on the CPU; waits for the GPU."""
         return BundleState(self.T.reshape(-1, 4, 4).cpu(), self.inverse_depth)
 
     def copy(self) -> "_State":
-        """A copy for a step to change."""
+        """Return a copy that a step may change."""
         return _State(self.memory.clone(), self.inverse_depth.clone())
 
 
@@ -155,10 +155,10 @@ class CudaDenseBundle:
         self._structures: LruCache[tuple[bytes, ...], _Structure] = LruCache(2)
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
-        """Take the steps; poses are returned where they were given.
+        """Take the steps; poses are returned on their original device.
 
-        Where steps need not lower the cost nobody waits for one to end, be it small
-        (``tolerance``) or not finite.
+        Where steps need not lower the cost, nothing waits for them, so neither small steps
+        (``tolerance``) nor non-finite ones end the loop early.
         """
         steps = _DenseSteps(self, problem, options)
         cost = steps.cost if options.lowers_cost else None
@@ -171,15 +171,15 @@ class CudaDenseBundle:
         return BundleResult(T, found.state.inverse_depth, steps.edges.information, finite)
 
     def structure_of(self, problem: BundleProblem) -> _Structure:
-        """The structure of a problem. Those of the last two are kept: edges are adjusted in rounds,
-        poses with depths and depths alone in turns."""
+        """Return the structure of a problem. The last two are cached: edges are adjusted in rounds,
+        poses with depths and depths alone in turn."""
         parts = (problem.source, problem.target, problem.free_pose, problem.free_depth)
         key = tuple(x.cpu().numpy().tobytes() for x in parts)
         return self._structures.get(key, lambda: _structure(problem, problem.inverse_depth.device))
 
 
 class _DenseSteps:
-    """One adjustment as the least-squares loop sees it, and what it keeps on the device."""
+    """Interface of one adjustment to the least-squares loop, and its memory on the device."""
 
     def __init__(
         self, bundle: CudaDenseBundle, problem: BundleProblem, options: BundleOptions
@@ -202,14 +202,14 @@ class _DenseSteps:
         self.blocks, self.vectors = like.new_empty(144 * pairs), like.new_empty(12 * pairs)
 
     def linearise(self, state: _State) -> bool:
-        """Edges, summed up by source; that they are."""
+        """Linearise edges, summed by source; return True."""
         self.edges.fill(
             self.grid, state.T, state.inverse_depth, self.matches, self.options, self.depth_terms
         )
         return True
 
     def step(self, state: _State, linear: bool, damping: float) -> Step[_State] | None:
-        """All moves on the device, which keeps in mind whether one was not finite."""
+        """Take a step on the device, which records whether it was not finite."""
         self._solve_cameras(state, damping)
         moved = self._moved(state)
         if not self.options.lowers_cost:
@@ -219,7 +219,7 @@ class _DenseSteps:
         return Step(moved, float(self.xi.abs().max()))
 
     def cost(self, state: _State, linear: bool) -> float:
-        """Twice what is minimised; waits."""
+        """Return the cost (twice the objective); waits for the GPU."""
         p = self.problem
         matched = edge_costs(
             self.kernels, self.structure.edges, self.grid, state.T, state.inverse_depth,
@@ -250,7 +250,7 @@ class _DenseSteps:
             self._solve_many_poses()
 
     def _add_pose_terms(self, state: _State, damping: float) -> None:
-        """Add what is said of poses alone to the assembled camera system, which waits for them."""
+        """Add the pose terms to the assembled camera system; waits for the GPU."""
         problem = self.problem
         if not problem.pose_terms:
             return
@@ -258,14 +258,14 @@ class _DenseSteps:
         for term in problem.pose_terms:
             poses.add(term.hyper_edges(here))
         hessian = poses.hessian[poses.free[:, None], poses.free]
-        # Of the system on the device only the lower blocks are in use.
+        # Only the lower blocks of the system on the device are used.
         diagonal = hessian.diagonal()
         diagonal += damping * diagonal.abs()
         added = torch.cat([hessian, poses.gradient[poses.free][None]])
         self.system += to_device(added.reshape(-1), self.system.device)
 
     def _solve_many_poses(self) -> None:
-        """Cholesky's method panel by panel."""
+        """Solve by Cholesky's method, panel by panel."""
         s, size = self.structure, 6 * self.structure.poses
         for k in range(0, size, PANEL):
             self.solvers["factor_panel"](1, 256, self.system, size, k, self.inverses, self.good)

@@ -1,4 +1,4 @@
-"""Terms of depths on the GPU, each of which has a place in the kernels."""
+"""Depth terms on the GPU, as kernel arguments."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -11,18 +11,18 @@ from geogs.bundle.terms import DepthTerm
 
 
 class KernelDepthTerms(NamedTuple):
-    """What the kernel ``sum_sources`` takes beside the matches; contiguous, none without."""
+    """Arguments of the kernel ``sum_sources`` besides matches; contiguous, None if absent."""
 
     damping: Float[Tensor, "n p"] | None = None
     """Curvature of a :class:`DepthDamping`."""
     measured: Float[Tensor, "n p"] | None = None
     """Inverse depth of :class:`MeasuredDepths`."""
     information: Float[Tensor, "n p"] | None = None
-    """Their information."""
+    """Information of :class:`MeasuredDepths`."""
 
     @staticmethod
     def of(terms: Iterable[DepthTerm]) -> "KernelDepthTerms":
-        """At most one of each kind; raises TypeError where there is another."""
+        """Convert terms, at most one of each kind; raises TypeError for any other."""
         found = KernelDepthTerms()
         for term in terms:
             if isinstance(term, DepthDamping) and found.damping is None:
@@ -37,5 +37,5 @@ class KernelDepthTerms(NamedTuple):
         return found
 
     def of_rows(self, rows: Tensor) -> "KernelDepthTerms":
-        """The same for some of the frames alone."""
+        """Return the terms of some of the frames."""
         return KernelDepthTerms(*(x if x is None else x[rows] for x in self))

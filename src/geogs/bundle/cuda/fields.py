@@ -16,11 +16,11 @@ from geogs.world.keyframes import Keyframe
 
 SOURCE = Path(__file__).with_name("fields.cu")
 MOST_THREADS = 1024
-"""Threads of a block, at most."""
+"""Most threads of a block."""
 
 
 def _pyramid_size(grid: SampleGrid) -> int:
-    """Floats of the coarser levels of one field and its confidence."""
+    """Return the number of floats of the coarser levels of one field and its confidence."""
     width, height, total = grid.width, grid.height, 0
     while min(width, height) > 2:
         width, height = -(-width // 2), -(-height // 2)
@@ -29,12 +29,12 @@ def _pyramid_size(grid: SampleGrid) -> int:
 
 
 class CudaFields(GridFields):
-    """Works on the fields of one grid on the GPU."""
+    """Operations on the fields of one grid on the GPU."""
 
     def fill(
         self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
     ) -> Float[Tensor, "*n p"]:
-        """All fields in one launch."""
+        """Fill all fields in one launch."""
         values, confidence = values.contiguous(), confidence.contiguous()
         out, size = torch.empty_like(values), _pyramid_size(self.grid)
         count = out.numel() // self.grid.size
@@ -80,7 +80,7 @@ class CudaFields(GridFields):
         information: Float[Tensor, "m p"],
         reproject: bool,
     ) -> tuple[Tensor, Tensor]:
-        """Depth of sources as seen from views at T (world to camera), which have none of their own.
+        """Transfer depth of sources to views at T (world to camera), which have none of their own.
 
         Returns inverse depth (n, p) and information (n, p) in the views, or, with ``reproject``,
         the pixels (n, p, 2) of the sources' cells in the views and of the views' cells in the

@@ -1,4 +1,4 @@
-"""Edges on the GPU: which there are, and what the kernels leave of them.
+"""Edges on the GPU: index arrays, and their linearisation by kernels.
 
 The dense and the streamed solver share these launches.
 """
@@ -21,14 +21,14 @@ from geogs.world.grid import SampleGrid
 
 
 def block_size(cells: int, most: int = 256) -> int:
-    """Threads of a block that goes over the cells of an edge: whole warps, 64 to ``most``."""
+    """Return the threads of a block over an edge's cells: whole warps, 64 to ``most``."""
     return max(64, min(-(-cells // 32) * 32, most))
 
 
 def edges_by_frame(
     frame: Int[Tensor, "e"], frames: int, device: torch.device
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "e"]]:
-    """Where the edges of each frame begin, and the end, in a list of all edges; and that list."""
+    """Sort edges by frame; return the start of each frame's edges, plus the end, and the order."""
     order = torch.argsort(frame, stable=True)
     first = torch.searchsorted(frame[order], torch.arange(frames + 1))
     rows = to_device(torch.cat([first, order]), device, torch.int32)
@@ -38,7 +38,7 @@ def edges_by_frame(
 def joined_edges(
     first: Int[np.ndarray, "m"], free_depth: Bool[np.ndarray, "n"]
 ) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
-    """Pairs a <= b of edges of one source; only a = b where its depth is fixed."""
+    """Return pairs a <= b of edges of one source; only a = b where its depth is fixed."""
     pairs = [np.zeros((2, 0), dtype=np.int64)]
     for begin, end, joined in zip(first[:-1], first[1:], free_depth, strict=True):
         count = end - begin
@@ -50,9 +50,9 @@ def joined_edges(
 
 @dataclass(frozen=True)
 class EdgeArrays:
-    """Which edges there are and how they meet, int32 on the device.
+    """Index arrays of edges, int32 on the device.
 
-    Frames have numbers of their own, the sources the first.
+    Frames are renumbered, sources first.
     """
 
     source: Tensor
@@ -60,9 +60,9 @@ class EdgeArrays:
     first: Tensor
     """First edge of each source, and the end."""
     free_depth: Tensor
-    """Whether each source's depth may move."""
+    """Whether each source's depth is free."""
     pair_a: Tensor
-    """Pairs a <= b of edges of one source that the elimination joins."""
+    """Pairs a <= b of edges of one source, joined by the elimination."""
     pair_b: Tensor
 
 
@@ -75,7 +75,7 @@ def edge_costs(
     matches: tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]],
     huber: float,
 ) -> Float[Tensor, "e"]:
-    """Huber's cost of the matched cells of each edge, float64: ``FlowTerm.cost``."""
+    """Compute Huber's cost of the matched cells of each edge, float64: ``FlowTerm.cost``."""
     a, c, cells = arrays, grid.camera, depth.shape[1]
     cost = depth.new_empty(len(a.source), dtype=torch.float64)
     kernels["find_edge_costs"](
@@ -86,7 +86,7 @@ def edge_costs(
 
 
 class LinearisedEdges:
-    """What the kernels leave of edges and their sources, on the device."""
+    """Linearised edges and their sources, on the device."""
 
     def __init__(
         self, kernels: Mapping[str, Kernel], arrays: EdgeArrays, depth: Float[Tensor, "s p"]
@@ -98,7 +98,7 @@ class LinearisedEdges:
         self.normal = depth.new_empty(32 * edges, dtype=torch.float64)
         self.coupling = depth.new_empty(6 * edges * cells)
         self.per_edge = depth.new_empty(2, edges * cells)
-        """Curvature and gradient of the depths of each edge's source, by it alone."""
+        """Curvature and gradient of the depths of each edge's source, by that edge alone."""
         self.information = torch.zeros_like(depth)
         self.depths = depth.new_empty(2, depth.numel())
         """Inverse damped curvature and gradient of all depths."""
@@ -117,7 +117,7 @@ class LinearisedEdges:
         options: BundleOptions,
         terms: KernelDepthTerms,
     ) -> None:
-        """Linearise all edges; sum up what they and all terms say of each source's depths."""
+        """Linearise all edges; sum the equations of each source's depths, with all terms."""
         a, c, (curvature, gradient) = self.arrays, grid.camera, self.per_edge
         self.kernels["linearise_edges"](
             len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
@@ -131,7 +131,7 @@ class LinearisedEdges:
         )  # fmt: skip
 
     def eliminate(self, blocks: Tensor, vectors: Tensor) -> None:
-        """What each pair of edges says of the poses: four blocks and two vectors, depths gone."""
+        """Eliminate depths: four blocks and two vectors of poses for each pair of edges."""
         a = self.arrays
         self.kernels["eliminate_depths"](
             len(a.pair_a), self.block, a.pair_a, a.pair_b, a.source, a.free_depth, self.coupling,
@@ -139,7 +139,7 @@ class LinearisedEdges:
         )  # fmt: skip
 
     def find_depth_steps(self, xi: Tensor, steps: Tensor, failed: Tensor) -> None:
-        """Steps of the sources' depths after those of all poses."""
+        """Compute steps of the sources' depths after those of all poses."""
         a = self.arrays
         self.kernels["find_depth_steps"](
             (-(-self.cells // self.block), len(a.free_depth)), self.block, a.first, a.target,

@@ -1,4 +1,4 @@
-"""Poses of frames against fixed keyframes on the GPU: one launch for all iterations."""
+"""Poses of frames relative to fixed keyframes on the GPU: one launch for all iterations."""
 
 from pathlib import Path
 
@@ -16,13 +16,13 @@ from geogs.world.keyframes import KNOWN, Keyframe
 SOURCE = Path(__file__).with_name("motion.cu")
 
 MOST_THREADS = 512
-"""Threads of a block, at most: the launch bound of these kernels."""
+"""Most threads of a block: the launch bound of these kernels."""
 
 
 class CudaMotion(MotionSolver):
     """Solver for some cells of a grid, or for all of them.
 
-    Poses and ``frame`` of a problem may be on the CPU; poses are returned where they were given.
+    Poses and ``frame`` of a problem may be on the CPU; poses are returned on their device.
     """
 
     def solve(
@@ -54,7 +54,7 @@ class CudaMotion(MotionSolver):
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
         grid, c, known = self.grid, self.grid.camera, keyframe.information
         device, threads = known.device, block_size(grid.size, MOST_THREADS)
-        # Both poses in one piece; behind them what is found.
+        # Both poses in one piece, followed by the results.
         found = torch.cat([torch.eye(4).reshape(-1), torch.zeros(7)]).to(T_guess)
         state = torch.cat([T_guess.reshape(-1), keyframe.T_cw.reshape(-1), found])
         state = to_device(state, device)

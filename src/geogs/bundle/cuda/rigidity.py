@@ -1,4 +1,4 @@
-"""What no depth explains of matches whose poses are known, on the GPU: one launch."""
+"""Residuals of matches at given poses that no depth explains, on the GPU: one launch."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from geogs.gpu.transfer import to_device
 
 SOURCE = Path(__file__).with_name("rigidity.cu")
 MOST_THREADS = 512
-"""Threads of a block, at most: the launch bound of the kernel."""
+"""Most threads of a block: the launch bound of the kernel."""
 
 
 def best_residuals(
@@ -29,7 +29,7 @@ def best_residuals(
     between: tuple[float, float],
     behind: float,
 ) -> Float[Tensor, "e p"]:
-    """Residuals as of :func:`geogs.bundle.rigidity.best_residuals`, from the motions along edges.
+    """Do :func:`geogs.bundle.rigidity.best_residuals`, given the motions along edges.
 
     These and ``source`` are on the CPU, all else on the GPU, where nothing waits.
     """

@@ -1,9 +1,9 @@
 """Bundle adjustment of many keyframes on the GPU: a few edges there at a time, poses on the CPU.
 
-The dense solver (:mod:`geogs.bundle.cuda.dense`) keeps all that is linearised, and a camera system
+The dense solver (:mod:`geogs.bundle.cuda.dense`) keeps all linearised edges, and a camera system
 whose memory grows with the square of the keyframes. Here edges are linearised chunk by chunk by
-the same kernels, their blocks added up, and forgotten; the camera system is sparse and solved by
-the CPU. Once the poses' steps are known, edges are linearised a second time for the depths.
+the same kernels, their blocks summed, and not kept; the camera system is sparse and solved by the
+CPU. Once the poses' steps are known, edges are linearised a second time for the depths.
 """
 
 from dataclasses import dataclass
@@ -27,30 +27,30 @@ from geogs.gpu.transfer import to_device, upload_indices
 from geogs.world.grid import SampleGrid
 
 EDGES_TOGETHER = 1024
-"""Directed edges that are linearised at a time; bounds memory (100 MB at 64 x 36 cells)."""
+"""Directed edges linearised at a time; bounds memory (100 MB at 64 x 36 cells)."""
 
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Some sources with all their edges; frames are numbered anew, sources first."""
+    """Some sources with all their edges; frames are renumbered, sources first."""
 
     edges: slice
     sources: Tensor
-    """Their numbers among all frames, on the CPU."""
+    """Indices of the sources among all frames, on the CPU."""
     frames: Tensor
-    """Sources, then the other frames that their edges reach."""
+    """Sources, then the other frames of their edges."""
     arrays: EdgeArrays
-    """The edges between frames by their new numbers."""
+    """Edges between frames by their new numbers."""
     added: Tensor
-    """Blocks of the elimination that are added to the camera system as they are..."""
+    """Blocks of the elimination that are added to the camera system untransposed."""
     added_to: Tensor
-    """... and to which of its blocks."""
+    """Blocks of the camera system to which these are added."""
     mirrored: Tensor
     mirrored_to: Tensor
-    """Likewise of those that are transposed first."""
+    """The same for blocks that are transposed first."""
     pulled: Tensor
     pulled_to: Tensor
-    """Vectors of the elimination, and to the right-hand side of which pose they are added."""
+    """Vectors of the elimination, and poses to whose right-hand side they are added."""
 
 
 class CudaStreamedBundle:
@@ -69,7 +69,7 @@ class CudaStreamedBundle:
 
 
 class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
-    """One adjustment that keeps nothing but the camera system of what it linearises."""
+    """One adjustment that only keeps the camera system of linearised edges."""
 
     def __init__(
         self, problem: StreamedProblem, bundle: CudaStreamedBundle, options: BundleOptions
@@ -83,7 +83,7 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         self.chunks = [_chunk(problem, part, self.system, device) for part in edges]
 
     def linearise(self, state: BundleState) -> SparseCameraSystem:
-        """Chunk by chunk."""
+        """Linearise chunk by chunk."""
         T, d, system = state.T_cw, state.inverse_depth, self.system
         system.clear()
         blocks = d.new_zeros(system.size, 36, dtype=torch.float64)
@@ -102,7 +102,7 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return system
 
     def flow_cost(self, state: BundleState) -> float:
-        """Chunk by chunk."""
+        """Compute the cost chunk by chunk."""
         d, cost = state.inverse_depth, state.inverse_depth.new_zeros(1, dtype=torch.float64)
         for chunk in self.chunks:
             depth = d[chunk.sources.to(d.device)]
@@ -113,13 +113,13 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return float(cost)
 
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
-        """The solution, found on the CPU."""
+        """Solve on the CPU."""
         return linear.solve(damping, FLOOR)
 
     def depth_steps(
         self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """The depths that follow by edges that are linearised a second time."""
+        """Compute the depth steps from edges linearised a second time."""
         d, xi = state.inverse_depth, step.reshape(-1, 6)
         delta = torch.zeros_like(d)
         failed = torch.zeros(1, dtype=torch.int32, device=d.device)
@@ -141,7 +141,7 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return edges
 
     def _poses(self, state: BundleState, chunk: _Chunk) -> Float[Tensor, "m"]:
-        """Poses of a chunk's frames on the device."""
+        """Return poses of a chunk's frames on the device."""
         return to_device(state.T_cw[chunk.frames].reshape(-1), state.inverse_depth.device)
 
     def _matches(self, chunk: _Chunk) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
@@ -152,7 +152,7 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
 def _chunk(
     problem: StreamedProblem, edges: slice, system: SparseCameraSystem, device: torch.device
 ) -> _Chunk:
-    """A chunk's index arrays, sent to the device in one piece."""
+    """Build a chunk's index arrays, copied to the device at once."""
     source, target = problem.source[edges].numpy(), problem.target[edges].numpy()
     own = np.unique(source)
     frames = np.concatenate([own, np.setdiff1d(target, own)])

@@ -1,1 +1,1 @@
-"""What is known of poses and depths at a solution, and of the errors that all matches share."""
+"""Uncertainty of poses and depths at a solution, and of errors common to all matches."""

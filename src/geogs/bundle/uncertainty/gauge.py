@@ -1,4 +1,4 @@
-"""Uncertainty of poses whose gauge is free: what no choice of world frame and unit takes away."""
+"""Uncertainty of poses with a free gauge: independent of the choice of world frame and unit."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ from torch import Tensor
 from geogs.geometry.lie import se3_inverse, so3_hat
 
 RANK = 1e-9
-"""Directions of the alignment that move the cameras by less than this part of the strongest are
-none: cameras on a line are turned about it freely, those at one place only moved."""
+"""Relative effect on the cameras below which a direction of the alignment is ignored: cameras on a
+line can be rotated about it freely, cameras at one position only translated."""
 
 
 class PoseDeviations(NamedTuple):
@@ -25,19 +25,19 @@ class PoseDeviations(NamedTuple):
 def deviations_after_alignment(
     T_cw: Float[Tensor, "n 4 4"], covariance: Float[Tensor, "m m"]
 ) -> PoseDeviations:
-    """Deviations of poses once the similarity is taken out that fits their errors best.
+    """Compute deviations of poses after removing the similarity that fits their errors best.
 
-    That is how a trajectory is compared with the truth, which has a frame and a unit of its own.
-    Whatever pose was fixed for the covariance, and whatever length, the answer is the same.
+    A trajectory is compared in this way with the truth, which has its own frame and unit. The
+    result does not depend on the pose and the length that were fixed for the covariance.
 
     Args:
         T_cw: world to camera, float64.
         covariance: of the left perturbations (translation, then rotation) of all poses, m = 6n;
-            where it is not finite, nothing is known.
+            where it is not finite, deviations are infinite.
 
-    To first order, a perturbation moves a centre c by -R^T tau, and alignment takes from the moves
-    of all centres their projection on those of a Sim(3), (I, -[c]x, c); from the turns in the
-    world, -R^T phi, their mean, as the rotation that fits the orientations best does.
+    To first order, a perturbation moves a centre c by -R^T tau, and alignment removes from the
+    shifts of all centres their projection on those of a Sim(3), (I, -[c]x, c); from the rotations
+    in the world, -R^T phi, their mean, as the best-fitting rotation does.
     """
     n, R_wc = len(T_cw), T_cw[:, :3, :3].mT
     both = covariance.reshape(n, 2, 3, n, 2, 3)
@@ -53,7 +53,7 @@ def deviations_after_alignment(
 
 
 def _left_over(covariance: Float[Tensor, "m m"], J: Float[Tensor, "m k"]) -> Float[Tensor, "n"]:
-    """Deviation of each three numbers after the projection on the columns of J is taken out."""
+    """Return the deviation of each three numbers after removing the projection on J's columns."""
     if not bool(covariance.isfinite().all()):
         return covariance.new_full((len(covariance) // 3,), torch.inf)
     Q, strength, _ = torch.linalg.svd(J, full_matrices=False)

@@ -1,10 +1,10 @@
-"""What matches say of the error of a lens, and what it costs the poses.
+"""Error of a lens estimated from matches, and its effect on the poses.
 
-A lens that bends by a thousandth lets every keyframe of a walk straight on seem a little shorter
-than the one before it: what lies ahead moves outwards, where it is magnified otherwise. All matches
-of a video say so alike, and neither their residuals nor more of them tell; but the error is of a
-known shape. Its sizes (:data:`SHAPES`) are unknowns that the poses and depths are eliminated from.
-They are estimated, and what is left open of them is considered in what is said of poses.
+With a distortion error of a thousandth every step of a straight walk seems a little shorter than
+the one before it: points ahead move outwards, where the magnification differs. All matches of a
+video have this error, so neither residuals nor more matches reveal it; but its shape is known. Its
+sizes (:data:`SHAPES`) are unknowns from which poses and depths are eliminated. They are estimated,
+and their remaining errors are considered in the uncertainty of poses.
 Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bierman 1977).
 """
 
@@ -29,39 +29,38 @@ from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
 
 RADIAL = 3
-"""Shapes of the error of a pixel x off the axis: x, x |x|^2, x |x|^4, for the logarithm of the
-focal length, and OpenCV's k1 and k2."""
+"""Number of radial shapes of the error at x from the axis: x, x |x|^2, x |x|^4, for the logarithm
+of the focal length, and OpenCV's k1 and k2."""
 SHAPES = RADIAL + 2
-"""And one along either side of the image, for the principal point, in focal lengths."""
+"""All shapes: also one along either side of the image for the principal point, in focal lengths."""
 Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
-"""What is to be added to where cells of a problem's edges were found for a readout that is longer
-by a part of it: one shape more."""
+"""Returns the shifts of a problem's matches per relative change of the readout: one more shape."""
 LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001, 0.001, 0.002), 0.005
-"""No size is known better, however many matches agree: half of what they say of lenses that have no
-error (docs/notebook/lens.md)."""
+"""Least deviation of each size, however many matches agree: half of the sizes estimated for lenses
+without error (docs/notebook/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
-"""Deviations of the radial sizes before any match is asked."""
+"""Prior deviations of the radial sizes."""
 CENTRE, GIVEN_CENTRE = 0.03, 0.002
-"""Deviation of the principal point, of a lens that nobody measured and of one that somebody did."""
+"""Prior deviation of the principal point of an uncalibrated and of a calibrated lens."""
 STANDARD_ERRORS = 3.0
-"""Standard errors of the matches' own estimate that are taken for a deviation of the lens: matches
-of different keyframes err alike, too. Errors are 1 to 7 of them in rendered rooms."""
+"""Deviation of the lens in standard errors of the matches' estimate, as errors of different
+keyframes are correlated, too. Errors are 1 to 7 of them in rendered rooms."""
 FOCAL_LEFT = 0.05
-"""What the focal length is off by after its correction, of the correction, whatever matches say: 0
-to 9 % where it was corrected by a fifth to a half (docs/notebook/lens.md)."""
+"""Remaining error of the focal length after its correction, as a fraction of the correction: 0 to
+9 % where it was corrected by a fifth to a half (docs/notebook/lens.md)."""
 PARTS, SURE = 6, 5.0
-"""Parts of a video whose focal lengths are compared; deviations by which they differ by chance."""
+"""Parts of a video whose focal lengths are compared, and difference in deviations due to chance."""
 
 
 def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
-    """Deviations of the sizes before any match is asked, of a focal length that is known to a
-    relative ``focal_deviation``, which may be a guess; 0 where somebody said it."""
+    """Return prior deviations of the sizes, for a focal length with a relative ``focal_deviation``
+    if it was estimated or guessed; 0 if it was given."""
     centre = CENTRE if focal_deviation > 0 else GIVEN_CENTRE
     return max(focal_deviation, PRIOR[0]), PRIOR[1], PRIOR[2], centre, centre
 
 
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "5 *b 2"]:
-    """Offset of the camera's pixel from what is seen, for each size of one, to first order."""
+    """Return the pixel offset for each shape with size one, to first order."""
     focal, plane = pixels.new_tensor([camera.fx, camera.fy]), camera.plane(pixels)
     off, flat = pixels - pixels.new_tensor([camera.cx, camera.cy]), focal * plane
     square = plane.square().sum(-1, keepdim=True)
@@ -77,11 +76,11 @@ def shape_shifts(
     at: CellProjection,
     sizes: Float[Tensor, "m 5"],
 ) -> Float[Tensor, "m e p 2"]:
-    """What is to be added to where cells were found, for each of some errors of these sizes.
+    """Return shifts of matches for each of some errors with these sizes.
 
-    What a cell shows lies off it, and so does what is found in the target; the former is carried
-    over at the cell's own depth. The latter is taken where the cell falls (``at``): where it was
-    found is off by the residual, and the product of both would count as evidence.
+    The content of a cell is offset from it, and so is its match in the target; the former offset is
+    propagated at the cell's depth. The latter is evaluated at the cell's projection (``at``): the
+    match itself is off by the residual, and the product of both would count as evidence.
     """
     there, here = (
         torch.einsum("mk,k...->m...", sizes, lens_shapes(camera, p))
@@ -97,7 +96,7 @@ def shifts_of_edges(
     at: CellProjection,
     sizes: Float[Tensor, "e 2 5"],
 ) -> Float[Tensor, "e p 2"]:
-    """The same for one error of each edge's source and one of its target."""
+    """Return shifts of matches for one error of each edge's source and one of its target."""
     there = torch.einsum("ek,kepc->epc", sizes[:, 1], lens_shapes(camera, at.pixels))
     own = lens_shapes(camera, _own_pixels(camera, rays))
     here = torch.einsum("ek,kpc->epc", sizes[:, 0], own)
@@ -105,7 +104,7 @@ def shifts_of_edges(
 
 
 def _own_pixels(camera: Camera, rays: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
-    """Where cells with these rays are."""
+    """Return the pixels of cells with these rays."""
     own = rays.new_tensor([camera.fx, camera.fy]) * camera.bent(rays[:, :2])
     return own + rays.new_tensor([camera.cx, camera.cy])
 
@@ -115,17 +114,17 @@ class LensEvidence:
     """Normal equations of the sizes of a lens' error, poses and depths eliminated."""
 
     information: Float[Tensor, "s k k"]
-    """Information of each source frame; their sum is that of all."""
+    """Information of each source frame; the sum is that of all."""
     gradient: Float[Tensor, "s k"]
-    """The direction of descent; likewise."""
+    """Direction of descent of each source frame."""
     moves: Float[Tensor, "m k"]
-    """Moves of all poses by an error of size one, left perturbations; m = 6n."""
+    """Changes of all poses by an error of size one, left perturbations; m = 6n."""
     depth_moves: Float[Tensor, "n c k"]
-    """Moves of the inverse depths of some cells of each frame, as fractions of these; none (c = 0)
-    where nobody asked."""
+    """Relative changes of the inverse depths of some cells of each frame; c = 0 if not
+    requested."""
 
     def joined(self, other: "LensEvidence") -> "LensEvidence":
-        """The evidence of both, poses of one after those of the other."""
+        """Concatenate the evidence of both, poses of one after those of the other."""
         return LensEvidence(
             torch.cat([self.information, other.information]),
             torch.cat([self.gradient, other.gradient]),
@@ -135,16 +134,16 @@ class LensEvidence:
 
     @property
     def bend(self) -> "LensEstimate":
-        """Estimate of k1 and k2, focal length and principal point being right."""
+        """Estimate of k1 and k2, with focal length and principal point fixed."""
         return self._of(range(1, RADIAL))
 
     def agreement(self, other: "LensEvidence") -> float:
-        """Cross-validation of k1 and k2 between two parts of a video: by what fraction of the most
-        that is possible either's estimate lowers the other's cost, at least; 1 at most."""
+        """Cross-validate k1 and k2 between two parts of a video: decrease of either's cost by the
+        other's estimate, as a fraction of the largest possible; the smaller of both, at most 1."""
         return min(self._validated(other), other._validated(self))
 
     def _validated(self, other: "LensEvidence") -> float:
-        """Fraction of the largest decrease of the cost that the other's k1 and k2 reach."""
+        """Return the fraction of the largest decrease of the cost by the other's k1 and k2."""
         information = self.information.sum(0)[1:RADIAL, 1:RADIAL]
         gradient = self.gradient.sum(0)[1:RADIAL]
 
@@ -156,11 +155,11 @@ class LensEvidence:
 
     @property
     def focal_change(self) -> float:
-        """Difference of the focal lengths that parts of the video want, as a fraction of them,
-        beyond what each leaves open; 0 where they agree.
+        """Relative difference of the focal lengths that fit parts of the video best, beyond their
+        deviations; 0 where they agree.
 
-        Each by its own residuals, poses and depths as all want them together. Where somebody zooms
-        these are hard to explain by one lens, however well each part is explained by itself.
+        Each is estimated from the part's own residuals, with the poses and depths of all. If the
+        lens zooms, one lens does not explain them, however well each part is explained alone.
         """
         parts = torch.tensor_split(torch.arange(len(self.gradient)), PARTS)
         found = [
@@ -177,12 +176,12 @@ class LensEvidence:
         return max(0.0, most - least - SURE * float(deviation[ends].norm()))
 
     def whole(self, with_centre: bool = True) -> "LensEstimate":
-        """Estimate of all sizes together, but for those of a principal point that is right."""
+        """Estimate all sizes together, optionally without the principal point."""
         every = range(self.gradient.shape[1])
         return self._of([n for n in every if with_centre or not RADIAL <= n < SHAPES])
 
     def _of(self, asked: Sequence[int]) -> "LensEstimate":
-        """Estimate of some sizes, the others being right."""
+        """Estimate some sizes, the others being zero."""
         sizes = list(asked)
         information = self.information[:, sizes][:, :, sizes]
         least = tuple((*LEAST, LEAST_OF_READOUT)[n] for n in sizes)
@@ -191,15 +190,14 @@ class LensEvidence:
     def considered(
         self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
     ) -> Considered:
-        """Second moments of what the error of the lens does to poses and depths.
+        """Return second moments of the changes of poses and depths due to the error of the lens.
 
-        The matches' estimate is combined with the prior (:func:`lens_prior`). Poses and depths move
-        by the estimate, as if it were taken off, and by what it leaves open; besides by what is
-        left of a focal length that was ``corrected`` by a factor, which matches do not tell of.
-        ``doubt`` is the deviation of a readout that is one more size, as a fraction of it.
-        ``LEAST`` is not added: errors that matches have in common pass for one of the lens that
-        hardly moves a pose, and three sizes of such deviations would move poses two to five times
-        as far.
+        The matches' estimate is combined with the prior (:func:`lens_prior`). Poses and depths
+        change by the estimate, as if the matches were corrected for it, and by its covariance; also
+        by the remaining error of a focal length that was ``corrected`` by a factor, which matches
+        do not determine. ``doubt`` is the relative deviation of a readout, one more size. ``LEAST``
+        is not added: common errors of matches look like a lens error that hardly changes a pose,
+        and three sizes of such deviations would change poses two to five times as much.
         """
         said = _estimate(self.information, self.gradient)
         expected = (*lens_prior(focal_deviation), doubt)
@@ -229,43 +227,43 @@ class LensEstimate(NamedTuple):
         return self.covariance.diagonal().sqrt()
 
     def without(self, size: int) -> "LensEstimate":
-        """The estimate of the others where one is known to be zero."""
+        """Return the estimate of the other sizes, given that one is zero."""
         known, left = self.told(size, 0.0, 0.0), torch.arange(len(self.size)) != size
         return LensEstimate(known.size[left], known.covariance[left][:, left])
 
     def told(self, size: int, value: float, deviation: float) -> "LensEstimate":
-        """The estimate with what was known of one size before: a value and its deviation."""
+        """Return the estimate updated by a prior on one size: a value and its deviation."""
         column = self.covariance[:, size]
         gain = column / (column[size] + deviation**2)
         moved = self.size + gain * (value - self.size[size])
         return LensEstimate(moved, self.covariance - gain[:, None] * column)
 
     def shortened(self, size: int, most: float) -> "LensEstimate":
-        """The sizes as far as one of them goes no farther than that."""
+        """Scale all sizes down so that one of them is at most ``most``."""
         part = (most / self.size[size].abs()).clamp(max=1)
         return LensEstimate(part * self.size, self.covariance)
 
     def floored(self, least: tuple[float, ...]) -> "LensEstimate":
-        """With no size known better than so."""
+        """Return it with least deviations of the sizes added."""
         floor = torch.diag(self.size.new_tensor(least).square())
         return LensEstimate(self.size, self.covariance + floor)
 
     def of(self, sizes: slice) -> "LensEstimate":
-        """Some of the sizes, whatever the others are."""
+        """Return the marginal estimate of some of the sizes."""
         return LensEstimate(self.size[sizes], self.covariance[sizes, sizes])
 
     @property
     def evidence(self) -> float:
-        """Square of the sizes in their deviations."""
+        """Squared Mahalanobis distance of the sizes from zero."""
         return float(self.size @ torch.linalg.solve(self.covariance, self.size))
 
 
 def _estimate(each: Float[Tensor, "s k k"], gradient: Float[Tensor, "s k"]) -> LensEstimate:
-    """The sizes that matches want, and their covariance.
+    """Estimate the sizes from matches, with their covariance.
 
-    That is what the matches themselves leave open, and a cluster-robust one beside, by source
-    frames (Liang and Zeger's sandwich, as in :func:`~geogs.bundle.shared.solve_shared`): it is
-    the larger by far where there is evidence, and nothing where there is none.
+    The covariance is the inverse of the information plus a cluster-robust one, by source frames
+    (Liang and Zeger's sandwich, as in :func:`~geogs.bundle.shared.solve_shared`): the latter is
+    the larger by far where there is evidence, and zero where there is none.
     """
     information = each.sum(0)
     damping = torch.diag(1e-9 * information.diagonal() + 1e-12)
@@ -283,17 +281,17 @@ def lens_evidence(
     rows: Rows | None = None,
     of_depths: bool = False,
 ) -> LensEvidence | None:
-    """What the matches of a problem at its solution say of the error of the lens.
+    """Compute the evidence of a problem's matches, at its solution, on the error of the lens.
 
-    None where they do not tell of all poses.
+    None where they do not determine all poses.
 
     Args:
-        grid: where the depths are.
-        problem: as of :func:`~geogs.bundle.uncertainty.marginals.marginals`; it is linearised once.
-        options: Huber's limit and the damping of depths.
-        cells: most cells of a frame that are asked; the others are taken to say the same.
-        rows: shape of an error of the readout, which is the last size then.
-        of_depths: whether to tell by how much depths move, too.
+        grid: of the depths.
+        problem: as for :func:`~geogs.bundle.uncertainty.marginals.marginals`; linearised once.
+        options: Huber threshold and the damping of depths.
+        cells: most cells of a frame that are used; they represent the others.
+        rows: shape of an error of the readout, which is then the last size.
+        of_depths: whether to compute the changes of depths, too.
     """
     thinned = ThinnedProblem(grid, problem, cells)
     scale = 1 / thinned.fraction
@@ -319,26 +317,26 @@ def lens_evidence(
 
 
 class _Reduced(NamedTuple):
-    """Equations of the poses that a source joins, and of the sizes, its depths eliminated."""
+    """Equations of a source's poses and of the sizes, with its depths eliminated."""
 
     rows: Int[Tensor, "c"]
     poses: Float[Tensor, "c c"]
     pull: Float[Tensor, "c k"]
-    """Gradient on the poses of matches that are off by a size of one."""
+    """Gradient on the poses by an error of size one."""
     descent: Float[Tensor, "c"]
-    """Gradient of the residuals on the poses."""
+    """Gradient on the poses by the residuals."""
     on_depth: Float[Tensor, "k p"]
-    """Gradient on the depths of matches that are off by a size of one."""
+    """Gradient on the depths by an error of size one."""
     information: Float[Tensor, "k k"]
     gradient: Float[Tensor, "k"]
-    """Direction of descent of the sizes, poses being fixed."""
+    """Direction of descent of the sizes at fixed poses."""
 
 
 def _reduced(
     thinned: ThinnedProblem, options: BundleOptions, rows: Rows | None
 ) -> Iterator[_Reduced]:
-    """Each source in order. What is to be added to a match is what the lens takes off where its
-    cell falls: so are the signs of what joins sizes and poses or depths."""
+    """Yield each source in order. A shift added to a match is subtracted from the cell's projection
+    by the lens, hence the signs of the terms that couple sizes with poses or depths."""
 
     def fallen(part: BundleProblem) -> Float[Tensor, "e o p 2"]:
         T_ji = relative_motion(part.T_cw, part.source, part.target)

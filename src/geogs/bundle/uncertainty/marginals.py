@@ -1,8 +1,8 @@
-"""How well an adjustment knows its poses and inverse depths: marginal variances at its solution.
+"""Marginal variances of an adjustment's poses and inverse depths at its solution.
 
 With the reduced camera system S of all terms (depths eliminated) and the coupling e of an inverse
-depth with the poses, ``var d = 1/c + e^T S^-1 e / c^2``: what its own matches leave open, and what
-the poses do. Source: the block inverse; Rosinol et al. 2023 use it for dense bundle adjustment.
+depth with the poses, ``var d = 1/c + e^T S^-1 e / c^2``: due to its own matches, and due to the
+poses. Source: the block inverse; Rosinol et al. 2023 use it for dense bundle adjustment.
 """
 
 from collections.abc import Iterator
@@ -24,62 +24,61 @@ from geogs.geometry.robust import weighted_median
 from geogs.world.grid import SampleGrid
 
 ALIKE = 2.25
-"""Matches of neighbouring cells err alike, and so do those of one cell along several edges: by how
-much their sum says less than its weights do. Measured on rendered rooms at the start of a map,
-where the errors are 0.4 to 0.9 of what the weights foretell in the median, and up to 1.3 times that
-at their upper tenth."""
+"""Factor on variances, as errors of neighbouring cells, and of one cell along several edges, are
+correlated. Measured on rendered rooms at the start of a map, where the errors are 0.4 to 0.9 of the
+predicted ones in the median, and up to 1.3 times these at their upper tenth."""
 DEPTHS_ALIKE = 0.56
-"""The same of what is said of depths, for the path as long as it is: errors of cells among the best
-known are 0.3 to 0.7 of what ``ALIKE`` foretells, and less what they have in common, in 20 rendered
+"""The same factor for depths, given the length of the path: errors of the best known cells are 0.3
+to 0.7 of those predicted with ``ALIKE``, and smaller without their common part, in 20 rendered
 clips of one to two seconds (docs/notebook/uncertainty.md)."""
 BEST_KNOWN = 0.15
-"""Part of a keyframe's cells that stands for its depths, half again as many as frames are followed
-by. Of bare walls matches tell nothing, however far the camera has moved; what stands before them is
-no worse known for it."""
+"""Fraction of a keyframe's cells that represents its depths, half again as many as tracking needs.
+Matches determine nothing on bare walls, however far the camera has moved, but objects in front of
+them are known no less well."""
 PLACES = 8, 5
-"""Parts of the image, across and down; what matches of one part have in common is taken for
-independent of what those of another have."""
+"""Parts of the image, across and down; common errors of matches of different parts are assumed to
+be independent."""
 COMMON_FLOW = 0.1
-"""What matches of a part have in common all along a video, in their own deviations, of the way by
-which the scene moves in the image: the other way round from a later to an earlier frame."""
+"""Common flow error of the matches of a part along the whole video, as a fraction of their
+deviation; its sign changes from a later to an earlier frame."""
 COMMON_PLACE = 0.15
-"""The same of the place in the image, whichever frame is the earlier; beside what an error of the
-lens does (:mod:`geogs.bundle.uncertainty.lens_error`)."""
+"""Common error of their position in the image, likewise, whichever frame is the earlier; apart from
+that by an error of the lens (:mod:`geogs.bundle.uncertainty.lens_error`)."""
 
 
 class Considered(NamedTuple):
-    """Second moments of the moves of a solution by errors that are not solved for."""
+    """Second moments of the changes of a solution by errors that are not solved for."""
 
     covariance: Float[Tensor, "m m"]
     """Second moments of all poses, in the order of :class:`Marginals`."""
     relative_depth: Float[Tensor, "n c"]
-    """Squares of the moves of its cells' inverse depths, as parts of these."""
+    """Squares of the relative changes of the cells' inverse depths."""
     focal: float = 0.0
-    """Square of the error of the focal length, as a part of it, which the width of things shares
-    and no depth does."""
+    """Squared relative error of the focal length, which affects the width of things but not their
+    depth."""
 
 
 @dataclass(frozen=True)
 class Marginals:
     """Variances of the free unknowns of a problem, in units and radians; on the CPU.
 
-    Zero for what is fixed, infinite for what no match tells of.
+    Zero for fixed unknowns, infinite for those that no match determines.
     """
 
     covariance: Float[Tensor, "m m"]
     """Covariance of the left perturbations of all poses, m = 6n; float64."""
     relative_depth: Float[Tensor, "n c"]
-    """Deviation of the inverse depth of some cells of each frame, as a part of it."""
+    """Relative deviation of the inverse depth of some cells of each frame."""
     normalised_residual: Float[Tensor, "n"]
     """Median residual of the matches from each frame, in their own standard deviations (two
-    dimensions), each counted by what it says: 1.2 where errors are as expected, more where the
-    scene is not as modelled."""
+    dimensions), weighted by information: 1.2 where errors are as expected, more where the scene is
+    not as modelled."""
     focal_variance: float = 0.0
-    """Variance of the focal length, as a fraction of it."""
+    """Relative variance of the focal length."""
     focal_change: float = 0.0
-    """Difference of the focal lengths that parts of the video want, as a fraction of them."""
+    """Relative difference of the focal lengths that fit parts of the video best."""
     lens_change: float = 0.0
-    """Part of the matches' cost that a lens of each frame of its own would take off."""
+    """Fraction of the matches' cost that per-frame intrinsics would remove."""
 
     @property
     def pose(self) -> Float[Tensor, "n 6 6"]:
@@ -89,18 +88,18 @@ class Marginals:
 
     @property
     def is_bounded(self) -> bool:
-        """Whether matches tell of all poses."""
+        """Whether matches determine all poses."""
         return bool(self.covariance.isfinite().all())
 
     def beside(self, errors: Considered) -> "Marginals":
-        """With errors that are independent of these."""
+        """Add errors that are independent of these."""
         relative = (self.relative_depth.square() + errors.relative_depth).sqrt()
         covariance, focal = self.covariance + errors.covariance, self.focal_variance + errors.focal
         return replace(self, covariance=covariance, relative_depth=relative, focal_variance=focal)
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
-        """Worst deviation among the ``BEST_KNOWN`` fraction of each frame's cells; infinite where
+        """Largest deviation among the ``BEST_KNOWN`` fraction of each frame's cells; infinite where
         fewer have matches."""
         return self.relative_depth.quantile(BEST_KNOWN, -1, interpolation="higher")
 
@@ -108,14 +107,13 @@ class Marginals:
 def marginals(
     grid: SampleGrid, problem: AnyProblem, options: BundleOptions, cells: int = 1024
 ) -> Marginals:
-    """Marginal variances at the present state of a problem, its matches as good as they say.
+    """Compute marginal variances at the present state of a problem, from the matches' weights.
 
     Args:
-        grid: where the depths are.
+        grid: of the depths.
         problem: at its solution; a large one is linearised in parts, twice.
-        options: Huber's limit and the damping of depths.
-        cells: most cells of a frame that are looked at, evenly spread; the others' matches are
-            taken to be as good.
+        options: Huber threshold and the damping of depths.
+        cells: most cells of a frame that are used, evenly spread; they represent the others.
 
     Where at most one pose is fixed, lengths are relative to the distances of the cameras from it.
     """
@@ -144,17 +142,17 @@ def common_errors(
     found: Marginals,
     cells: int = 1024,
 ) -> Considered:
-    """What matches have wrong in common, beside what ``found`` says of poses and depths.
+    """Compute the effect of common errors of matches, which ``found`` does not include.
 
-    A glossy floor, a slanted wall, a texture that is smoothed alike in all images: such errors are
-    small beside those of a single match, but neither cells nor keyframes average them. No residual
-    tells of them, as the solution follows them. Each is a number of its own, for a part of the
-    image and an axis, that is not solved for; by how much it moves the solution follows from the
-    equations that ``found`` is the inverse of. Source: consider analysis (Schmidt 1966; Bierman
-    1977). Zero where ``found`` knows nothing.
+    A glossy floor, a slanted wall, a texture smoothed in the same way in all images: such errors
+    are small compared with those of a single match, but averaging over cells and keyframes does not
+    reduce them. Residuals do not show them, as the solution follows them. Each is one number for a
+    part of the image and an axis, which is not solved for; its effect on the solution follows from
+    the equations whose inverse is ``found``. Source: consider analysis (Schmidt 1966; Bierman
+    1977). Zero where ``found`` is not bounded.
 
     Args:
-        grid, problem, options, cells: as of :func:`marginals`, which gave ``found``.
+        grid, problem, options, cells: as for :func:`marginals`, which gave ``found``.
     """
     relative = torch.zeros_like(found.relative_depth)
     if not found.is_bounded:
@@ -176,11 +174,11 @@ def common_errors(
 def _common_pulls(
     thinned: ThinnedProblem, options: BundleOptions, place: Float[Tensor, "p q"]
 ) -> Iterator[tuple[SourceFlow, Float[Tensor, "c k"], Float[Tensor, "4 p"]]]:
-    """Each source in order, and by how much each error that matches have in common, at its
-    deviation, pulls at the poses that it joins once depths have followed, and at its depths.
+    """Yield each source in order, with the gradients of each common error, at its deviation, on the
+    source's poses after elimination of depths, and on its depths.
 
-    Of each axis there are two, along the flow and of the place, wherever in the image: an error in
-    a part of it pulls at the depths that are there (``place``).
+    There are two for each axis, of flow and of position, over the whole image: an error in a part
+    of it acts on the depths there (``place``).
     """
     flow = LensFlow(thinned.lens)
     for part in thinned.parts(options):
@@ -203,7 +201,7 @@ def _common_pulls(
 
 
 def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
-    """One where a cell lies in a part of the image."""
+    """Return one where a cell lies in a part of the image, else zero."""
     across, down = PLACES
     camera, pixels = thinned.camera, thinned.pixels
     x, y = (pixels / pixels.new_tensor([camera.width, camera.height])).mT
@@ -212,18 +210,18 @@ def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
 
 
 def pose_covariance(problem: AnyProblem, H: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
-    """Inverse of a reduced camera system over all poses, zero for the fixed ones.
+    """Invert a reduced camera system over all poses; zero for the fixed ones.
 
-    Infinite where that cannot be told. Where at most one pose is fixed, the unit of length is.
+    Infinite where it is singular. If at most one pose is fixed, the unit of length is fixed, too.
     """
     fixed = ~problem.free_pose.cpu()
     free = torch.nonzero(~fixed.repeat_interleave(6))[:, 0]
-    S = H[free[:, None], free]  # changed in place: of three hundred poses it takes 26 MiB
+    S = H[free[:, None], free]  # changed in place: 26 MiB for three hundred poses
     if int(fixed.sum()) <= 1:
         origin = int(torch.nonzero(fixed)[0, 0]) if bool(fixed.any()) else 0
         along = _scaling(problem.T_cw.double().cpu(), origin)[free]
         S.addr_(along, along, alpha=1e3 * float(H.diagonal().max()))
-    # What no match tells of is open, not an error: its variance becomes very large.
+    # Undetermined unknowns are no error: their variance becomes very large.
     S.diagonal().add_(1e-9 * (S.diagonal().abs() + 1e-6))
     S, failed = torch.linalg.cholesky_ex(S)
     S = torch.full_like(S, torch.inf) if int(failed) else torch.cholesky_inverse(S)
@@ -235,11 +233,11 @@ def pose_covariance(problem: AnyProblem, H: Float[Tensor, "m m"]) -> Float[Tenso
 def _normalised_residual(
     problem: AnyProblem, part: ThinnedProblem, options: BundleOptions
 ) -> Float[Tensor, "n"]:
-    """Median residual from each frame; infinite without matches.
+    """Return the median residual from each frame; infinite without matches.
 
-    Matches count by their information. On a bare wall the flow continues what is around it, so its
-    residuals are small however badly the others fit: counted by number, an image would seem the
-    better known the more of it is bare.
+    Matches are weighted by their information. On a bare wall the flow continues its surroundings,
+    so its residuals are small however badly the others fit: unweighted, an image would seem to fit
+    better the more of it is bare.
     """
     found = torch.full((len(problem.T_cw),), torch.inf)
     for frame, norm, information in part.residuals(options):
@@ -249,14 +247,14 @@ def _normalised_residual(
 
 
 def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
-    """Unit step of all poses in which their distances from one camera grow together."""
+    """Return the unit step of all poses that scales their distances from one camera."""
     away = T_cw[:, :3, :3] @ se3_inverse(T_cw[origin])[:3, 3] + T_cw[:, :3, 3]
     along = torch.cat([away, torch.zeros_like(away)], 1).reshape(-1)
     return along / along.norm().clamp(min=1e-12)
 
 
 def _depth_variance(source: SourceFlow, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
-    """Variance of a source's inverse depths, by its matches and the covariance of its poses."""
+    """Return variances of a source's inverse depths, by its matches and its poses' covariance."""
     depth, rows = source.depth, source.edges.rows(len(covariance) // 6)
     E = source.edges.chained_coupling()
     among = covariance[rows[:, None], rows].to(E)

@@ -1,6 +1,6 @@
-"""Some cells of an adjustment, which stand for all where it is asked how well it is known.
+"""A subset of an adjustment's cells, which represents all in the estimation of uncertainty.
 
-Linearised on the CPU, some edges at a time, wherever the matches lie.
+Linearised on the CPU, some edges at a time, whatever the device of the matches.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ AnyProblem = BundleProblem | StreamedProblem
 
 
 class ThinnedProblem:
-    """A problem with some of the cells, which stand for all of them; on the CPU."""
+    """A problem with a subset of the cells, which represents all of them; on the CPU."""
 
     def __init__(self, grid: SampleGrid, problem: AnyProblem, cells: int) -> None:
         step = -(-grid.size // cells)
@@ -37,7 +37,7 @@ class ThinnedProblem:
         self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
 
     def sources(self, options: BundleOptions) -> Iterator[SourceFlow]:
-        """All sources, in order."""
+        """Yield all linearised sources, in order."""
         flow = LensFlow(self.lens)
         for part in self.parts(options):
             yield from linearised_sources(flow, part, part.start, options)
@@ -45,10 +45,10 @@ class ThinnedProblem:
     def depth_moves(
         self, source: SourceFlow, pull: Float[Tensor, "c k"], moves: Float[Tensor, "m k"]
     ) -> Float[Tensor, "c k"]:
-        """Moves of the inverse depths of a source by errors of matches of size one each.
+        """Return relative changes of a source's inverse depths by errors of matches of size one.
 
-        As fractions of these: ``C^-1 (pull - E^T moves)``, with their ``pull`` at the depths and
-        the ``moves`` of all poses by them. Zero for what is fixed, or has no match.
+        They are ``C^-1 (pull - E^T moves)`` over the inverse depths, with the gradients ``pull`` on
+        the depths and the ``moves`` of all poses. Zero for fixed depths, or without a match.
         """
         depth, rows = source.depth, source.edges.rows(len(moves) // 6)
         left = pull - source.edges.chained_coupling().mT @ moves[rows].to(pull)
@@ -59,8 +59,8 @@ class ThinnedProblem:
     def residuals(
         self, options: BundleOptions
     ) -> Iterator[tuple[int, Float[Tensor, "m"], Float[Tensor, "m"]]]:
-        """Each source in order, norms of its matches' residuals in standard deviations, and what
-        these matches say along both axes together, 1 / pixel^2."""
+        """Yield each source in order, norms of its matches' residuals in standard deviations, and
+        the information of these matches, summed over both axes, 1 / pixel^2."""
         for part in self.parts(options):
             i, j = part.source, part.target
             T_ji = relative_motion(part.T_cw, i, j)
@@ -72,7 +72,7 @@ class ThinnedProblem:
                 yield frame, norm[edges][own], part.weight[edges].sum(-1)[own]
 
     def parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
-        """Some edges at a time, with the terms of depths."""
+        """Yield problems of some edges at a time, with the depth terms."""
         p, cells = self._problem, self._cells
         terms = tuple(_ThinnedTerm(term, p.start, cells) for term in p.depth_terms)
         for chunk in source_chunks(p.source.cpu(), options.chunk):
@@ -86,11 +86,11 @@ class ThinnedProblem:
 
 @dataclass(frozen=True)
 class _ThinnedTerm:
-    """A term of depths on some of the cells."""
+    """A depth term on a subset of the cells."""
 
     term: DepthTerm
     state: BundleState
-    """With all cells."""
+    """State with all cells."""
     cells: slice
     information: None = None
 

@@ -1,9 +1,9 @@
-"""What matches say of intrinsics that change from frame to frame.
+"""Estimation from matches of intrinsics that change from frame to frame.
 
-A lens that is focused anew magnifies otherwise (focus breathing), one that is stabilised moves
-before its sensor or has its image cropped elsewhere, and a zoom does the first on purpose. The
-focal length and the principal point of each frame, beside those of all, are unknowns that poses and
-depths are eliminated from, along with the lens that all share.
+Refocusing changes the magnification (focus breathing), as zooming does on purpose; stabilisation
+moves the lens relative to the sensor, or the crop of the image. The focal length and the principal
+point of each frame, relative to the shared ones, are unknowns, along with the shared lens; poses
+and depths are eliminated.
 Source: self-calibration with varying intrinsics (Pollefeys, Koch, Van Gool 1999), in the
 adjustment.
 """
@@ -36,23 +36,23 @@ from geogs.geometry.lie import se3_adjoint
 from geogs.world.grid import SampleGrid
 
 OWN = 0, RADIAL, RADIAL + 1
-"""Of the shapes of a lens' error, those that each frame has of its own: the logarithm of the focal
-length, and the principal point along either side."""
+"""Shapes of a lens' error that are per-frame parameters: the logarithm of the focal length, and the
+principal point along either side."""
 EXPLAINED = 0.1
-"""Part of the matches' cost that has to go where something of a lens changes: 0.33 where the focal
-length does by 1 %, below 0.06 where nothing does (docs/notebook/lens.md)."""
+"""Least relative cost reduction for a parameter to be freed: 0.33 where the focal length varies by
+1 %, below 0.06 where nothing varies (docs/notebook/lens.md)."""
 LEAST = 2e-4
-"""Smallest deviation of a size, that of one which does not vary, too."""
+"""Smallest deviation of a per-frame parameter, also of one that does not vary."""
 FIRST_DEVIATION = 0.02
-"""Of what frames have of their own before any match is asked."""
+"""Initial prior deviation of per-frame parameters."""
 EXPECTATIONS = 10
-"""Steps by which deviations are told."""
+"""EM iterations."""
 COUNTS = 0.1
-"""Fraction of what matches say that counts, as those of an edge err together."""
+"""Weight of the matches' evidence, as errors of an edge's matches are correlated."""
 
 
 class LensChange(Enum):
-    """What of a lens may change from frame to frame."""
+    """Parameters of a lens that may change from frame to frame."""
 
     FOCAL = "focal length"
     CENTRE = "principal point"
@@ -60,28 +60,27 @@ class LensChange(Enum):
 
 @dataclass(frozen=True)
 class VaryingPrior:
-    """What frames have of their own before any match is asked: independent of each other, and of
-    the focal length a random walk beside. Deviations, which the video itself tells; zero of what
-    does not change."""
+    """Prior on per-frame intrinsics: white noise, plus a random walk of the focal length. Standard
+    deviations, estimated from the video; zero for parameters that do not vary."""
 
     jitter: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the sizes of each frame."""
+    """Deviation of each parameter of a frame."""
     drift: float = 0.0
-    """Of the logarithm of the last frame's focal length from the first one's."""
+    """Deviation of the logarithm of the last frame's focal length from the first one's."""
 
     def varies(self, change: LensChange) -> bool:
-        """Whether something changes."""
+        """Whether a parameter varies."""
         return self.jitter[0 if change is LensChange.FOCAL else 1] > 0
 
     def also(self, change: LensChange) -> "VaryingPrior":
-        """With something more that changes, by as much as may be expected of any lens."""
+        """Return the prior with another varying parameter, with its initial deviation."""
         focal, *centre = self.jitter
         if change is LensChange.FOCAL:
             return VaryingPrior((FIRST_DEVIATION, centre[0], centre[1]), FIRST_DEVIATION)
         return VaryingPrior((focal, FIRST_DEVIATION, FIRST_DEVIATION), self.drift)
 
     def information(self, times: Float[Tensor, "n"]) -> Float[Tensor, "3 n n"]:
-        """Inverse covariance of each size of frames at some times; they are independent."""
+        """Return the inverse covariance of each parameter at some times; they are independent."""
         found = torch.zeros(len(OWN), len(times), len(times), dtype=torch.float64)
         for n, (part, square) in enumerate(zip(_parts(times), self._squares, strict=True)):
             found[n % len(OWN)] += square * part
@@ -94,8 +93,8 @@ class VaryingPrior:
     def between(
         self, known: Float64[np.ndarray, "n"], times: Float64[np.ndarray, "m"]
     ) -> Float[Tensor, "m 3"]:
-        """Deviations of frames at some times from what those around them, whose sizes are
-        ``known``, have interpolated: of a bridge, and of what each has beside."""
+        """Return deviations of frames at some times from values interpolated between those at
+        ``known`` times: of a Brownian bridge plus white noise."""
         after = np.searchsorted(known, times).clip(1, len(known) - 1)
         before, length = known[after - 1], max(known[-1] - known[0], 1e-9)
         span = np.maximum(known[after] - before, 1e-9)
@@ -110,8 +109,8 @@ class VaryingPrior:
         sizes: Float[Tensor, "n 3"],
         covariance: Float[Tensor, "n 3 n 3"],
     ) -> "VaryingPrior":
-        """That which suits sizes that are known to a covariance better: a step of expectation
-        maximisation of components of a variance. What does not change stays so."""
+        """Take one EM update of the variances, given parameters with their covariance. Parameters
+        that do not vary stay fixed."""
         prior, squares = self.information(times), self._squares
         found = []
         for n, (part, square) in enumerate(zip(_parts(times), squares, strict=True)):
@@ -126,7 +125,7 @@ class VaryingPrior:
 
 
 def _parts(times: Float[Tensor, "n"]) -> list[Float[Tensor, "n n"]]:
-    """Covariances of size one: of what is independent for each size, and of a random walk."""
+    """Return unit covariances: of white noise for each parameter, and of a random walk."""
     alone = torch.eye(len(times), dtype=torch.float64)
     first, last = times.min(), times.max()  # a saved map's frames may be of later times
     past = (times - first).double() / (last - first).clamp(min=1e-9)
@@ -138,16 +137,16 @@ FIRST = VaryingPrior().also(LensChange.FOCAL).also(LensChange.CENTRE)
 
 @dataclass(frozen=True)
 class VaryingEvidence:
-    """Normal equations of what each frame's lens has of its own, then of what all share."""
+    """Normal equations of per-frame intrinsics, then of the shared ones."""
 
     information: Float[Tensor, "k k"]
-    """k = 3 n + 5; poses and depths are eliminated."""
+    """Hessian, k = 3 n + 5; poses and depths are eliminated."""
     gradient: Float[Tensor, "k"]
-    """The direction of descent."""
+    """Direction of descent."""
     cost: float
-    """Of the matches' residuals, twice what is minimised."""
+    """Cost of the matches' residuals (twice the objective)."""
     moves: Float[Tensor, "m k"]
-    """By how much an error of size one moves all poses, left perturbations; m = 6 n."""
+    """Changes of all poses by an error of size one, left perturbations; m = 6 n."""
 
     def solved(
         self,
@@ -156,8 +155,8 @@ class VaryingEvidence:
         prior: VaryingPrior,
         shared: Float[Tensor, "5"],
     ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k k"]]:
-        """Steps of all sizes and their covariance, where ``taken`` of them was taken off already;
-        what all share is known to be zero to the deviations ``shared``."""
+        """Solve for steps of all parameters, with their covariance. ``taken``: values for which
+        matches are already corrected; ``shared``: prior deviations of the shared ones from zero."""
         own = len(self.gradient) - SHAPES
         known = torch.zeros_like(self.information)
         for k, each in enumerate(prior.information(times)):
@@ -173,8 +172,8 @@ class VaryingEvidence:
         prior: VaryingPrior,
         shared: Float[Tensor, "5"],
     ) -> tuple[Float[Tensor, "k"], VaryingPrior]:
-        """Steps as of :meth:`solved`, with what frames have of their own of the deviations that
-        suit it best, found from ``prior`` on: second."""
+        """Return steps as in :meth:`solved`, and the prior estimated with them by EM, starting from
+        ``prior``."""
         frames, own = len(times), len(self.gradient) - SHAPES
         for _ in range(EXPECTATIONS):
             step, covariance = self.solved(times, taken, prior, shared)
@@ -183,7 +182,7 @@ class VaryingEvidence:
         return step, prior
 
     def explained(self, step: Float[Tensor, "k"]) -> float:
-        """Part of the cost that a step takes off beyond what a lens that all share would."""
+        """Return the relative cost reduction of a step beyond that of the shared lens alone."""
         less = 2 * self.gradient @ step - step @ self.information @ step
         H, g = self.information[-SHAPES:, -SHAPES:], self.gradient[-SHAPES:]
         damping = torch.diag(1e-9 * H.diagonal() + 1e-12)
@@ -194,16 +193,16 @@ class VaryingEvidence:
 def varying_evidence(
     grid: SampleGrid, problem: AnyProblem, options: BundleOptions, cells: int = 256
 ) -> VaryingEvidence | None:
-    """What the matches of a problem at its solution say of the lens of each frame.
+    """Compute the evidence of a problem's matches, at its solution, on the lens of each frame.
 
-    None where they do not tell of all poses. Sizes are those to be taken off the matches
-    (:func:`~geogs.bundle.uncertainty.lens_error.shape_shifts`).
+    None where they do not determine all poses. Parameters are errors for which matches are to be
+    corrected (:func:`~geogs.bundle.uncertainty.lens_error.shape_shifts`).
 
     Args:
-        grid: where the depths are.
-        problem: as of :func:`~geogs.bundle.uncertainty.marginals.marginals`; it is linearised once.
-        options: Huber's limit and the damping of depths.
-        cells: most cells of a frame that are asked; the others are taken to say the same.
+        grid: of the depths.
+        problem: as for :func:`~geogs.bundle.uncertainty.marginals.marginals`; linearised once.
+        options: Huber threshold and the damping of depths.
+        cells: most cells of a frame that are used; they represent the others.
     """
     thinned = ThinnedProblem(grid, problem, cells)
     n, own = len(problem.T_cw), len(OWN)
@@ -245,16 +244,16 @@ def considered_lenses(
     times: Float[Tensor, "n"],
     shared: Float[Tensor, "5"],
 ) -> Considered:
-    """What is left open of the lens of each frame, once it was found, and what that does to poses
-    and depths; of the focal length of all nothing is said.
+    """Compute the effect of the remaining errors of per-frame intrinsics on poses and depths,
+    without the shared focal length.
 
     Args:
         evidence: of the same problem.
-        grid, problem, options: as of :func:`varying_evidence`.
-        cells: of a frame at most, whose depths are looked at.
-        own: what was found, which tells by how much lenses vary.
+        grid, problem, options: as for :func:`varying_evidence`.
+        cells: most cells of a frame whose depths are used.
+        own: estimated per-frame intrinsics, which determine the prior.
         times: of the frames.
-        shared: deviations of the lens of all.
+        shared: prior deviations of the shared lens.
     """
     zero, n = torch.zeros_like(evidence.gradient), len(times)
     prior = FIRST
@@ -279,7 +278,7 @@ def considered_lenses(
 
 
 def _of_poses(edges: HyperEdge) -> HyperEdge:
-    """Without what else they share."""
+    """Return the edges without shared unknowns."""
     assert edges.depth is not None
     size = len(edges.gradient) - edges.shared
     depth = replace(edges.depth, coupling=edges.depth.coupling[:size])
@@ -288,14 +287,14 @@ def _of_poses(edges: HyperEdge) -> HyperEdge:
 
 
 def _places(poses: Int[Tensor, "e"], frames: int) -> Int[Tensor, "m"]:
-    """Of the sizes that a source's edges join: its targets', its own, and those of all."""
+    """Return indices of the parameters of a source's edges: of targets, itself, then shared."""
     own = len(OWN)
     each = (own * poses[:, None] + torch.arange(own)).reshape(-1)
     return torch.cat([each, own * frames + torch.arange(SHAPES)])
 
 
 class OwnLensFlow:
-    """Dense flow of a pinhole's cells, with a lens' error of each frame and one of all."""
+    """Dense flow of a pinhole's cells, with per-frame and shared errors of the lens."""
 
     def __init__(self, thinned: ThinnedProblem) -> None:
         self._camera, self._rays, self._pixels = thinned.camera, thinned.rays, thinned.pixels
@@ -303,15 +302,15 @@ class OwnLensFlow:
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """As in the protocol of terms; shared unknowns are the sizes of the targets' lenses, of the
-        source's, and of that of all."""
+        """Yield sources as in the protocol; shared unknowns are the parameters of the targets, of
+        the source, then of the shared lens."""
         camera, own = self._camera, list(OWN)
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         p = linearise(camera, self._rays, T_ji, state.inverse_depth[problem.source])
         r, w = weighed_residuals(p, problem.pixels, problem.weight, options.huber)
         there, here = lens_shapes(camera, p.pixels), lens_shapes(camera, self._pixels)
         here = carried_over(camera, self._rays, T_ji, p, here[:, None].expand_as(there))
-        # What is to be added to a match is what the lens takes off where its cell falls.
+        # A shift added to a match is subtracted from the cell's projection.
         moved = torch.cat([-there[own], here[own], here - there]).permute(1, 0, 3, 2)
         J = torch.cat([p.pose_jacobian, moved], 1)
         wJ, by_depth = J * w.mT[:, None], p.depth_jacobian.mT[:, None]
@@ -341,7 +340,7 @@ class OwnLensFlow:
             )
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """As in the protocol, of what is weighed now."""
+        """Return the cost as in the protocol, with present weights."""
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         p = project(self._camera, self._rays, T_ji, state.inverse_depth[problem.source])
         r, w = weighed_residuals(p, problem.pixels, problem.weight, huber)
@@ -349,8 +348,8 @@ class OwnLensFlow:
 
 
 def _edge_places(edges: int, own: int, unknowns: int) -> Int[Tensor, "e k"]:
-    """Where the unknowns of each edge stand among those of its source: its relative motion, its
-    target's sizes, then those that all edges have."""
+    """Return indices of each edge's unknowns among those of its source: its relative motion, its
+    target's parameters, then those of all edges."""
     each = torch.arange(edges)[:, None]
     motion = 6 * each + torch.arange(6)
     target = 6 * edges + own * each + torch.arange(own)

@@ -168,7 +168,7 @@ class _Intrinsics:
     def _estimated(
         self, evidence: Evidence, prior: VaryingPrior
     ) -> tuple[list[Tensor], VaryingPrior, float]:
-        """Return steps of all parts, the prior after EM, and the largest relative cost reduction."""
+        """Return steps of all parts, prior after EM, and the largest relative cost reduction."""
         steps, explained = [], 0.0
         for frames, part in evidence:
             times = [self._keyframes[k].timestamp for k in frames]
