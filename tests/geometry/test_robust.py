@@ -7,7 +7,6 @@ import torch
 from geogs.geometry.robust import (
     cauchy_cost,
     cauchy_weight,
-    geman_mcclure_cost,
     geman_mcclure_weight,
     huber_cost,
     huber_weight,
@@ -16,7 +15,7 @@ from geogs.geometry.robust import (
 KERNELS = {
     "huber": (lambda s: huber_cost(s, 1.3), lambda s: huber_weight(s.sqrt(), 1.3)),
     "cauchy": (cauchy_cost, cauchy_weight),
-    "geman_mcclure": (geman_mcclure_cost, geman_mcclure_weight),
+    "geman_mcclure": (lambda s: s / (1 + s), geman_mcclure_weight),
 }
 
 

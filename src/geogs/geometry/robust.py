@@ -39,11 +39,6 @@ def geman_mcclure_weight(square: A) -> A:
     return 1 / (1 + square) ** 2
 
 
-def geman_mcclure_cost(square: A) -> A:
-    """Return Geman and McClure's cost ``square / (1 + square)``."""
-    return square / (1 + square)
-
-
 def weighted_median(values: Float[Tensor, "n"], weights: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Return the least value up to which lies half of the weight, of at least one value."""
     order = values.argsort()

@@ -28,9 +28,9 @@ from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
 
-MIN_CLIP_FPS = 8.0
-"""Recorded frame rate below which an unknown readout is not estimated from clips: all images are
-located then, and their residuals determine it with its error (docs/photographs.md)."""
+MIN_READOUT_FPS = 8.0
+"""Recorded frame rate below which a readout estimated before the run is not used: structure from
+motion estimates its own by residuals (docs/photographs.md)."""
 
 
 def offline_config(config: Config) -> ReconstructConfig:
@@ -143,8 +143,8 @@ class PlacedOffline(Work):
 
 def beginning_with(video: Source, found: Source) -> Source:
     """A video with the estimated shutter, and focal length where none was given, as the start of
-    structure from motion, which estimates its own; see ``MIN_CLIP_FPS``, too."""
-    begun = video if video.recorded_fps < MIN_CLIP_FPS else video.with_shutter(found.shutter)
+    structure from motion, which estimates its own; see ``MIN_READOUT_FPS``, too."""
+    begun = video if video.recorded_fps < MIN_READOUT_FPS else video.with_shutter(found.shutter)
     if not video.is_calibration_open:
         return begun
     lens = found.calibration
