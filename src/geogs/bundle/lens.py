@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import CellProjection, project, relative_motion
-from geogs.bundle.row_motions import RowMotions
 from geogs.geometry.camera import Camera
 
 UNIT = 0.01
@@ -30,17 +29,15 @@ class LensBlock:
     """Whether the focal length is a variable."""
     radial: bool = False
     """Whether k1 and k2 are variables."""
-    rows: RowMotions | None = None
-    """Motion of frames during readout; None for a global shutter."""
     readout: float = 0.0
-    """Seconds from the first to the last row: the last unknown where there are ``rows``."""
-    rolls: bool = True
-    """Whether the readout is a variable."""
+    """Seconds from the first to the last row."""
+    rolls: bool | None = None
+    """Whether the readout is a variable; None for a global shutter, which has no such unknown."""
 
     @property
     def free(self) -> tuple[bool, ...]:
         """Whether each unknown is a variable."""
-        of_rows = () if self.rows is None else (self.rolls,)
+        of_rows = () if self.rolls is None else (self.rolls,)
         return self.focal, self.radial, self.radial, *of_rows
 
     @cached_property
@@ -52,25 +49,6 @@ class LensBlock:
         """Return the block after a step of all unknowns, zero for those that are no variables."""
         *lens, longer = [*step.tolist(), 0.0][:4]
         return replace(self, lens=self.lens.moved(*lens), readout=self.readout + UNIT * longer)
-
-    def slopes(
-        self,
-        T_ji: Float[Tensor, "e 4 4"],
-        source: Int[Tensor, "e"],
-        target: Int[Tensor, "e"],
-        inverse_depth: Float[Tensor, "n p"],
-    ) -> Float[Tensor, "e p 2"] | None:
-        """Return derivatives of the cells' positions by the readout in seconds; None for a global
-        shutter."""
-        if self.rows is None:
-            return None
-        return self.rows.slopes(self.lens, self.rays.rays, T_ji, inverse_depth, source, target)
-
-    def unrolled(
-        self, pixels: Float[Tensor, "e p 2"], slopes: Float[Tensor, "e p 2"] | None
-    ) -> Float[Tensor, "e p 2"]:
-        """Correct positions of cells for the rolling shutter."""
-        return pixels if slopes is None else pixels - self.readout * slopes
 
     def project(
         self,

@@ -45,15 +45,14 @@ class LensFlow:
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         block = self._block(state)
-        by_rows = block.slopes(T_ji, problem.source, problem.target, state.inverse_depth)
-        adjoint, edges = se3_adjoint(T_ji), _Edges(block, problem, T_ji, by_rows)
+        adjoint, edges = se3_adjoint(T_ji), _Edges(block, problem, T_ji)
         limits = _limits(options.huber)
         slopes = edges.slopes if self._known is None else edges.slopes[:0]
         further = np.zeros((len(edges.weight), 0, 0, 2), np.float32)
         if self._further is not None:
             further = _float(self._further(problem))
-        elif by_rows is not None:
-            further = _float(UNIT * by_rows[:, None])
+        elif problem.by_rows is not None:
+            further = _float(UNIT * problem.by_rows[:, None])
         shared = len(slopes) + further.shape[1]
         for frame, e in sources_within(problem.source):
             size = 6 * (e.stop - e.start) + shared
@@ -75,8 +74,7 @@ class LensFlow:
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         block = self._block(state)
-        by_rows = block.slopes(T_ji, problem.source, problem.target, state.inverse_depth)
-        edges = _Edges(block, problem, T_ji, by_rows)
+        edges = _Edges(block, problem, T_ji)
         behind, limits = np.float32((BEHIND * huber) ** 2), _limits(huber)
         return sum(
             cost_of_source(
@@ -94,17 +92,13 @@ class _Edges:
     """Edges and the lens as kernel arguments."""
 
     def __init__(
-        self,
-        block: LensBlock,
-        problem: BundleProblem,
-        T_ji: Float[Tensor, "e 4 4"],
-        by_rows: Float[Tensor, "e p 2"] | None,
+        self, block: LensBlock, problem: BundleProblem, T_ji: Float[Tensor, "e 4 4"]
     ) -> None:
         lens = block.lens
         self.motions = _float(T_ji[:, :3])
         self.rays, self.slopes = _float(block.rays.rays[:, :2].mT), _float(block.rays.slope)
         self.lens = np.array(lens.numbers, np.float32)
-        self.pixels = _float(block.unrolled(problem.pixels, by_rows))
+        self.pixels = _float(problem.unrolled(block.readout))
         self.weight = _float(problem.weight)
 
 

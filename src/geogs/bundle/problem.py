@@ -1,7 +1,7 @@
 """Adjustment problems: frames, matches along the edges between them, and other terms."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -65,10 +65,20 @@ class BundleProblem(Problem):
     """Measured position in the target of every cell of the source."""
     weight: Float[Tensor, "e p 2"]
     """Inverse variance of x and y, 1 / pixel^2."""
+    by_rows: Float[Tensor, "e p 2"] | None = None
+    """Shift of the positions per second of readout (:class:`geogs.bundle.row_motions.RowMotions`);
+    None for a global shutter."""
+
+    def unrolled(self, readout: float) -> Float[Tensor, "e p 2"]:
+        """Return the positions that a global shutter would have seen, if rows took so many seconds
+        from the first to the last."""
+        return self.pixels if self.by_rows is None else self.pixels - readout * self.by_rows
 
     def part(self, edges: slice) -> "BundleProblem":
         """Return the same frames with some of the edges."""
-        return _part(self, edges, self.pixels[edges], self.weight[edges])
+        by_rows = None if self.by_rows is None else self.by_rows[edges]
+        some = _part(self, edges, self.pixels[edges], self.weight[edges])
+        return replace(some, by_rows=by_rows)
 
 
 @dataclass(frozen=True, kw_only=True)

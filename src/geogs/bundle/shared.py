@@ -22,7 +22,6 @@ from geogs.bundle.flow_term import residual_norms
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import relative_motion
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, minimise
@@ -126,10 +125,8 @@ def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
     """Return the median residual, in own deviations, of the matches in front of their targets, for
     an adjusted problem."""
     source, depth = problem.source, result.inverse_depth[problem.source]
-    T_ji, block = relative_motion(result.T_cw, source, problem.target), result.block
-    at = block.project(result.T_cw, source, problem.target, depth)
-    by_rows = block.slopes(T_ji, source, problem.target, result.inverse_depth)
-    found = residual_norms(at, block.unrolled(problem.pixels, by_rows), problem.weight)
+    at = result.block.project(result.T_cw, source, problem.target, depth)
+    found = residual_norms(at, problem.unrolled(result.block.readout), problem.weight)
     return float(found[at.valid & (problem.weight[..., 0] > 0)].median())
 
 

@@ -67,7 +67,7 @@ def estimate(bundle: GrowingBundle, unknowns: Unknowns) -> Estimate | str:
     whole = STANDARD_ERRORS**2 * result.covariance
     covariance = whole[:3, :3] + LEAST_DEVIATION**2 * asked.diag()
     readout = None
-    if result.block.rows is not None and result.block.rolls:
+    if result.block.rolls:
         readout = FoundReadout(result.block.readout, UNIT * float(whole[3, 3].sqrt()))
     said = with_prior(Estimate(lens, covariance, len(bundle), readout))
     if said.deviation < UNRELIABLE:

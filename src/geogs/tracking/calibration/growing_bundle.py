@@ -11,6 +11,7 @@ from torch import Tensor
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import relative_motion
 from geogs.bundle.row_motions import RowMotions, fitted_twists
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
 from geogs.geometry.lie import scaled
@@ -150,10 +151,10 @@ class GrowingBundle:
     def adjust(self) -> bool:
         """Solve for all unknowns and update the state; False if that fails."""
         problem, asked = self.problem(), self._unknowns
-        block = LensBlock(
-            self.lens, self.grid.pixels.cpu(), asked.focal, asked.radial,
-            self._motions(problem.inverse_depth), self.readout, asked.readout is None,
-        )  # fmt: skip
+        problem = replace(problem, by_rows=self._by_rows(problem))
+        rolls = None if problem.by_rows is None else asked.readout is None
+        pixels = self.grid.pixels.cpu()
+        block = LensBlock(self.lens, pixels, asked.focal, asked.radial, self.readout, rolls)
         result = solve_shared(problem, block, PATIENT, LEAST_DECREASE)
         if not result.finite:
             return False
@@ -167,18 +168,20 @@ class GrowingBundle:
         self._normalise()
         return True
 
-    def _motions(self, inverse_depth: Float[Tensor, "n p"]) -> RowMotions | None:
-        """Return the motions of views during readout, by the images next to them; None for a global
-        shutter, or where none of these images is near enough."""
+    def _by_rows(self, problem: BundleProblem) -> Float[Tensor, "e p 2"] | None:
+        """Return the shift of all matches per second of readout, by the motions of views in the
+        images next to them; None for a global shutter, or where none of these is near enough."""
         if self._rows is None:
             return None
         velocity, known = map(torch.stack, zip(*map(self._rows.velocity, self._views), strict=True))
-        rays = SampleGrid(self.lens).rays
+        rays, depth = SampleGrid(self.lens).rays, problem.inverse_depth
         known = known.cpu() & (torch.stack(self._information).cpu() > 0)
         if not known.any():
             return None
-        twist = fitted_twists(self.lens, rays, inverse_depth, velocity.cpu(), known)
-        return RowMotions(twist, self._rows.times)
+        twist = fitted_twists(self.lens, rays, depth, velocity.cpu(), known)
+        T_ji = relative_motion(problem.T_cw, problem.source, problem.target)
+        motions = RowMotions(twist, self._rows.times)
+        return motions.slopes(self.lens, rays, T_ji, depth, problem.source, problem.target)
 
     def _normalise(self) -> None:
         """Scale to a median depth of 1, so that limits and thresholds always mean the same."""
