@@ -23,7 +23,7 @@ _BOUNDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 1.0)
 """Successive bounds of the edges' costs, as fractions of the tolerance."""
 _WORTH_A_LOOK = 0.98
 """Fraction of the triangles that a wider bound may leave for the mesh to be checked."""
-_FIRST_BOUND, _LAST_BOUND, _WIDER = 1e-4, 0.02, 1.5
+_FIRST_BOUND, _LAST_BOUND, _WIDER = 1e-5, 0.02, 1.5
 """Bounds for a mesh with a largest number of triangles: the first and the last, as fractions of its
 extent, and the factor from one to the next."""
 _FEWEST = 200
