@@ -63,7 +63,7 @@ def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> Sa
     source = self_calibrated(open_source(settings.source, config.input), config, device)
     slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
     metadata = RunMetadata(
-        settings, device.type, source.fingerprint(), None, shutter=source.shutter
+        settings, device.type, source.fingerprint(), source.calibration, shutter=source.shutter
     )
     progress.expect(source.length)
     for frame in source:
