@@ -81,6 +81,16 @@ def test_what_is_given_is_not_looked_for(folder, monkeypatch):
         assert self_calibrated(source) is source
 
 
+def test_a_readout_that_nobody_uses_is_not_looked_for(folder, monkeypatch):
+    asked = finding(monkeypatch, FOUND)
+    given = open_source(folder, InputConfig(INTRINSICS))
+    assert self_calibrated(given, finds_readout=False) is given
+    assert not asked
+    guessed = self_calibrated(open_source(folder), finds_readout=False)
+    assert [(a.focal, a.readout) for a in asked] == [(True, None)]  # it would pass for a lens
+    assert guessed.is_shutter_open
+
+
 def test_a_lens_that_is_not_refined_is_unknown_while_the_readout_is_found(folder, monkeypatch):
     asked = finding(monkeypatch, FOUND)
     off = Config(calibration=CalibrationConfig(refine=False))

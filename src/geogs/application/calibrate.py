@@ -52,12 +52,14 @@ def self_calibrated(
     device: str | torch.device = "cpu",
     progress: RunProgress | None = None,
     stop: Stop | None = None,
+    finds_readout: bool = True,
 ) -> Source:
     """Estimate the unknown camera parameters of the source from the video, in one adjustment.
 
     These are the focal length and the distortion where they are a guess or nominal and may be
     refined, and the readout of the shutter. Where the video does not determine them, or after a
     request to stop, the guess stays, the shutter counts as global, and ``progress`` reports it.
+    Without ``finds_readout`` the shutter stays as it is.
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
     asks_lens = config.calibration.refine and source.is_calibration_open
@@ -66,7 +68,8 @@ def self_calibrated(
             f"warning: the intrinsics are unknown; assuming {source.intrinsics_origin}. Give "
             "--intrinsics fx,fy,cx,cy for a better result."
         )
-    if not (asks_lens or source.is_shutter_open):
+    asks_readout = finds_readout and source.is_shutter_open
+    if not (asks_lens or asks_readout):
         return source
     unknowns = _unknowns(source, asks_lens, config.calibration.radial)
     found = _found(progress, stop, partial(_self_calibration, source, unknowns, device))
@@ -82,7 +85,7 @@ def self_calibrated(
         calibration = refined(source.calibration, source.camera.fx, found)
         progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
         known = known.with_calibration(calibration)
-    if source.is_shutter_open:
+    if asks_readout:
         known = known.with_shutter(_shutter(found.readout))
         if found.readout.is_believed:
             progress.write(
@@ -193,8 +196,7 @@ def _shutter(found: FoundReadout) -> Shutter:
     """The estimated shutter; global where the estimate is not accepted."""
     if not math.isfinite(found.error):
         return Shutter(origin="the video does not tell", error=found.left_open)
-    told = f"the video says {_evidence(found)}"
-    return Shutter(found.readout, told, found.left_open)
+    return Shutter(found.readout, f"the video says {_evidence(found)}", found.left_open)
 
 
 def _evidence(found: FoundReadout) -> str:

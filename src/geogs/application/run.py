@@ -84,11 +84,13 @@ def run(
         opened = without_overlay(opened, progress)
         if settings.offline:
             from geogs.application.structure_from_motion.offline import (
+                MIN_READOUT_FPS,
                 PlacedOffline,
                 beginning_with,
             )
 
-            found = self_calibrated(opened, config, device, progress, stop)
+            finds_readout = opened.recorded_fps >= MIN_READOUT_FPS
+            found = self_calibrated(opened, config, device, progress, stop, finds_readout)
             return driver.complete(PlacedOffline(config, beginning_with(opened, found)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened)
         return _completed(driver, settings, work)
