@@ -23,21 +23,12 @@ _PAIRS = 20.0
 """Matched pairs for each photograph, if there are many photographs."""
 
 
-def stages_of_poses(count: int, features: int) -> dict[str, float]:
-    """Approximate seconds of each stage that finds the poses of ``count`` photographs."""
-    part, cores = features / MAX_FEATURES, worker_count()
-    pairs = min(0.5 * count * (count - 1), _PAIRS * count)
-    return {
-        "features": _A_PHOTOGRAPH * count / cores,
-        "choosing pairs": _ALIKE * count / cores,
-        "matching": (_TO_VERIFY + _TO_MATCH * part**2) * pairs / cores,
-        "finding poses": (_TO_START + _TO_PLACE * part) * count,
-    }
-
-
 def seconds_to_find_poses(count: int, features: int) -> float:
-    """Approximate seconds of all stages together."""
-    return sum(stages_of_poses(count, features).values())
+    """Approximate seconds to find the poses of ``count`` photographs."""
+    part = features / MAX_FEATURES
+    pairs = min(0.5 * count * (count - 1), _PAIRS * count)
+    shared = (_A_PHOTOGRAPH + _ALIKE) * count + (_TO_VERIFY + _TO_MATCH * part**2) * pairs
+    return shared / worker_count() + (_TO_START + _TO_PLACE * part) * count
 
 
 def features_for(count: int, seconds: float | None) -> int:

@@ -41,7 +41,6 @@ def _open(
             f"--{option} must say what {model} wants and gives: a YAML file, or one of "
             f"{', '.join(card_names())}."
         )
-    card = load_card(card_name)
     from geogs.priors.onnx import OnnxPrior
 
-    return OnnxPrior(Path(model), card, camera, device)
+    return OnnxPrior(Path(model), load_card(card_name), camera, device)

@@ -35,8 +35,6 @@ from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
 
-RECORDED = 4000
-"""Approximate longer side, in pixels, of photographs that are used at full size."""
 FIRST_BATCH = 24
 """Number of images read first; they show the cost per image, and so how many are affordable."""
 _MIN_BUDGET = 1.0

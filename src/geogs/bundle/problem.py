@@ -1,7 +1,7 @@
 """Adjustment problems: frames, matches along the edges between them, and other terms."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -77,8 +77,7 @@ class BundleProblem(Problem):
     def part(self, edges: slice) -> "BundleProblem":
         """Return the same frames with some of the edges."""
         by_rows = None if self.by_rows is None else self.by_rows[edges]
-        some = _part(self, edges, self.pixels[edges], self.weight[edges])
-        return replace(some, by_rows=by_rows)
+        return _part(self, edges, self.pixels[edges], self.weight[edges], by_rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,11 +92,15 @@ class StreamedProblem(Problem):
 
 
 def _part(
-    problem: Problem, edges: slice, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
+    problem: Problem,
+    edges: slice,
+    pixels: Float[Tensor, "e p 2"],
+    weight: Float[Tensor, "e p 2"],
+    by_rows: Float[Tensor, "e p 2"] | None = None,
 ) -> BundleProblem:
     shared = {f.name: getattr(problem, f.name) for f in fields(Problem)}
     shared |= {"source": problem.source[edges], "target": problem.target[edges]}
-    return BundleProblem(**shared, pixels=pixels, weight=weight)
+    return BundleProblem(**shared, pixels=pixels, weight=weight, by_rows=by_rows)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import linearise, seen_from_targets
+from geogs.bundle.projection import carried_over, linearise
 from geogs.geometry.camera import Camera
 from geogs.geometry.robust import geman_mcclure_weight
 
@@ -59,22 +59,14 @@ class RowMotions:
         """Return derivatives of the source cells' positions in targets by the readout in seconds.
 
         The shift by the target's row, less that by the source's row, propagated at the cell's
-        depth; both as steps of x / z and y / z.
+        depth.
         """
-        depth = inverse_depth[source]
-        y, _, z = seen_from_targets(rays, T_ji, depth)
-        plane, twist = y[..., :2] / z[..., None], self.twist[..., None]
-        there = _plane_velocity(plane, depth / z, twist[target])
-        there = there * self.times.of(camera.pixels(plane))[..., None]
-        here = _plane_velocity(rays[:, :2], inverse_depth, twist)
-        here = (here * self.times.of(camera.pixels(rays[:, :2]))[:, None])[source]
-        moved = (T_ji[:, :3, :2].to(here) @ here.mT).mT
-        step = there - (moved[..., :2] - plane * moved[..., 2:]) / z[..., None]
-        if not camera.is_pinhole:
-            xx, xy, yy = camera.bend_jacobian(plane)
-            right, down = step.unbind(-1)
-            step = torch.stack([xx * right + xy * down, xy * right + yy * down], -1)
-        return step * step.new_tensor([camera.fx, camera.fy])
+        at = linearise(camera, rays, T_ji, inverse_depth[source])
+        there = torch.einsum("ek,ekcp->epc", self.twist[target], at.pose_jacobian)
+        there = there * self.times.of(at.pixels)[..., None]
+        here = torch.einsum("nk,nkcp->npc", self.twist, _motions(camera, rays, inverse_depth))
+        here = here * self.times.of(camera.pixels(rays[:, :2]))[:, None]
+        return there - carried_over(camera, rays, T_ji, at, here[source])
 
 
 def fitted_twists(
@@ -108,20 +100,6 @@ def fitted_twists(
         off = (v - (twist[:, None] @ J)[:, 0]).unflatten(1, (2, -1)).norm(dim=1) / limit
         weight = known * geman_mcclure_weight(off.square())
     return twist.to(velocity)
-
-
-def _plane_velocity(
-    plane: Float[Tensor, "*b p 2"],
-    inverse_depth: Float[Tensor, "*c p"],
-    twist: Float[Tensor, "n 6 1"],
-) -> Float[Tensor, "n p 2"]:
-    """Return velocities of x / z and y / z of points by the twists of their cameras."""
-    x, y = plane.unbind(-1)
-    vx, vy, vz, wx, wy, wz = twist.unbind(1)
-    across, along = y * wx - x * wy, inverse_depth * vz
-    right = inverse_depth * vx - x * along - x * across + wy - y * wz
-    down = inverse_depth * vy - y * along - y * across - wx + x * wz
-    return torch.stack([right, down], -1)
 
 
 def _motions(

@@ -59,7 +59,7 @@ class GrowingBundle:
         """Grid of the guess; of its camera only the size is used."""
         self._operator, self._unknowns, self._rows = operator, unknowns, rows
         self.lens = start.lens
-        self.readout = (rows and rows.readout) or 0.0
+        self.readout = unknowns.readout or 0.0
         """Present readout, seconds."""
         self._views = views[: len(start.T_cw)]
         known = start.information.to(grid.device)

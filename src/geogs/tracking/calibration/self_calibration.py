@@ -89,7 +89,7 @@ def self_calibrate(
     gatherer, rows = ViewGatherer(images, grid, operator), None
     if unknowns.rolling is not None:
         times = _row_times(unknowns.rolling, small)
-        rows = OpenRows(times, gatherer.velocity, unknowns.readout)
+        rows = OpenRows(times, gatherer.velocity)
     failures: list[str] = []
     while len(failures) < STRETCHES and not (failures and gatherer.is_over):
         part = _part_of(report, len(failures))

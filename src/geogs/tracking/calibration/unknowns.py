@@ -35,5 +35,3 @@ class OpenRows:
     times: RowTimes
     velocity: Callable[["View"], tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]]
     """Returns velocities of a view's cells in pixels per second, and where they are known."""
-    readout: float | None = None
-    """Readout in seconds, if known."""
