@@ -172,11 +172,7 @@ def report(name: str, parts: Sequence[Found], seconds: float) -> None:
 
 
 def searched(
-    engine: DepthEngine,
-    keyframes: Sequence[Keyframe],
-    index: int,
-    checked: bool,
-    render: Camera,
+    engine: DepthEngine, keyframes: Sequence[Keyframe], index: int, checked: bool, render: Camera
 ) -> tuple[DenseDepth, float]:
     """The depth of a keyframe, if ``checked`` by its neighbours', and the seconds of its search."""
     chosen = neighbours_of(keyframes, index, render)

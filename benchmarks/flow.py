@@ -26,13 +26,13 @@ from geogs.io.sources.sniff import open_source
 from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
-from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels, load_flow_network
+from geogs.tracking.flow.network_parts import cell_pixels
+from geogs.tracking.flow.own_network import FlowNetwork, load_flow_network
 from geogs.world.grid import SampleGrid
 from geogs_train.flow.flow_loss import run_network
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
-from geogs_train.flow.flow_scores import CellErrors, summarise
-from geogs_train.flow.flow_validation import Validation, cell_errors
+from geogs_train.flow.flow_validation import CellErrors, Validation, cell_errors, summarise
 from geogs_train.flow.starts import StartOptions, disturbed_starts
 
 STARTS = {

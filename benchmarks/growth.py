@@ -19,7 +19,7 @@ import torch
 from geogs.config import LoopConfig, preset
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.lie import se3_inverse, sim3_exp, so3_exp
-from geogs.loop.consistency import consistent_loops
+from geogs.loop.closure import consistent_loops
 from geogs.loop.detect import LoopDetector
 from geogs.loop.pose_graph import PoseGraph, solve
 from geogs.loop.retrieval import AppearanceIndex

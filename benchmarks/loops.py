@@ -253,10 +253,7 @@ def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int
 
 def together(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """Test the detector as the system runs it."""
-    detector, clock = (
-        LoopDetector(store.table, operator, LoopConfig(min_gap=gap)),
-        Clock(),
-    )
+    detector, clock = (LoopDetector(store.table, operator, LoopConfig(min_gap=gap)), Clock())
     for k in store.ids:
         clock("update", lambda k=k: detector.update([k], is_last=True))
     right = [truth.right(o.first, o.second, o.T_ji) for o in detector.table.loops]

@@ -35,14 +35,8 @@ from geogs.application.results.surfaces import fusion_views
 from geogs.config import Config, MapAblation, MappingConfig
 from geogs.evaluation.surfaces.reconstruction_errors import evaluate_reconstruction
 from geogs.evaluation.surfaces.surface import Surface
-from geogs.evaluation.surfaces.triangle_tree import TriangleTree
-from geogs.geometry.lie import (
-    quaternion_to_matrix,
-    se3_exp,
-    se3_inverse,
-    sim3_exp,
-    sim3_inverse,
-)
+from geogs.evaluation.surfaces.surface_distance import TriangleTree
+from geogs.geometry.lie import quaternion_to_matrix, se3_exp, se3_inverse, sim3_exp, sim3_inverse
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closure import ClosingQuestion, close_loops
@@ -56,8 +50,9 @@ from geogs.world.loops import RelativePoses
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.textured_scene import scene_mesh
 from geogs_synth.sequence.location import centred_camera
-from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
+from geogs_synth.sequence.replica_files import SeenSurface
 
 CAMERA = centred_camera(320, 240)
 EVERY = 4

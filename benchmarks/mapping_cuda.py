@@ -33,7 +33,7 @@ from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
-from geogs.splat.cuda import passes
+from geogs.splat.cuda import rasterize
 from geogs.splat.init import initialise_disks
 from geogs.splat.render import NEAR, Rasterized, RenderOutput
 from geogs.world.disks import DiskParameters, GaussianMap
@@ -265,7 +265,7 @@ def parts_of(kernels: dict[str, float]) -> dict[str, float]:
 
 def started(make: Callable[[], Contestant]) -> tuple[Contestant, float]:
     """A contestant after two steps, and the peak memory of its tensors in MiB."""
-    passes._pool.cache_clear()  # no buffers of earlier renderings
+    rasterize._resting.cache_clear()  # no buffers of earlier renderings
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
     contestant = make()

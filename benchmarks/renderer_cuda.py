@@ -25,8 +25,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion, se3_inverse
-from geogs.splat.render import render
-from geogs.splat.vjp import render_vjp
+from geogs.splat.render import render, render_vjp
 from geogs.world.disks import DiskParameters
 from gpu_times import kernel_milliseconds
 

@@ -49,17 +49,23 @@ class BagWriter:
                 image = cv2.cvtColor(image, _FROM_RGB[encoding])
         self._raw(topic, k, image, encoding, padding, is_stamped)
 
+    def rows(self, topic, k, rows, encoding, height=48, is_bigendian=0) -> None:
+        """The rows of an image as bytes, in any encoding of 64 columns."""
+        self._raw(topic, k, rows, encoding, 0, True, None, height, is_bigendian)
+
     def depth(self, topic, k, depth) -> None:
         """A depth image in millimetres."""
         self._raw(topic, k, depth.view(np.uint8), "16UC1", 0, True, depth.shape)
 
-    def _raw(self, topic, k, pixels, encoding, padding, is_stamped, shape=None) -> None:
-        height = len(pixels)
+    def _raw(
+        self, topic, k, pixels, encoding, padding, is_stamped, shape=None, height=None, big=0
+    ) -> None:
         width = 64
-        rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, padding)), constant_values=99)
+        rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (0, padding)), constant_values=99)
         message = self._store.types[IMAGE](
             header=self._header(k if is_stamped else None),
-            height=height, width=width, encoding=encoding, is_bigendian=0, step=rows.shape[1],
+            height=height or len(pixels), width=width, encoding=encoding, is_bigendian=big,
+            step=rows.shape[1],
             data=np.ascontiguousarray(rows).reshape(-1),
         )  # fmt: skip
         self._write(topic, IMAGE, k, message)
@@ -111,12 +117,20 @@ class BagWriter:
         more = {"seq": 0} if self._is_1 else {}
         return self._store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera", **more)
 
+    def broken(self, topic, k) -> None:
+        """A message of a compressed image that ends too early."""
+        self._connect(topic, COMPRESSED)
+        self._writer.write(self._connections[topic], int(START + k * STEP), bytes(6))
+
     def _write(self, topic, kind, k, message) -> None:
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._store
-            )
+        self._connect(topic, kind)
         serialize = self._store.serialize_ros1 if self._is_1 else self._store.serialize_cdr
         self._writer.write(
             self._connections[topic], int(START + k * STEP), serialize(message, kind)
         )
+
+    def _connect(self, topic, kind) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._store
+            )

@@ -45,10 +45,12 @@ def write_video(
     gop: int = 4,
     title: str = "",
     index_first: bool = False,
+    aspect: Fraction | None = None,
 ) -> Path:
     """Write a video with the given presentation times (33 ms steps if none).
 
-    ``rotation`` is the counter-clockwise angle of the display matrix in degrees.
+    ``rotation`` is the counter-clockwise angle of the display matrix in degrees, ``aspect`` the
+    width of a pixel by its height.
     """
     height, width = images[0].shape[:2]
     times = milliseconds or [33 * i for i in range(len(images))]
@@ -60,6 +62,8 @@ def write_video(
         stream.codec_context.time_base = TIME_BASE
         stream.codec_context.gop_size = gop
         stream.codec_context.bit_rate = 2_000_000
+        if aspect is not None:
+            stream.codec_context.sample_aspect_ratio = aspect
         if rotation:
             stream.set_display_rotation(rotation)
         for image, time in zip(images, times, strict=True):

@@ -32,7 +32,5 @@ def random_view(seed: int, camera: Camera = CAMERA) -> tuple[list[torch.Tensor],
 
 
 ALL_TERMS = LossConfig(
-    normal_weight=0.1,
-    smoothness_weight=0.05,
-    ablation=LossAblation(smoothness_rewards_edges=True),
+    normal_weight=0.1, smoothness_weight=0.05, ablation=LossAblation(smoothness_rewards_edges=True)
 )

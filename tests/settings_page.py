@@ -23,6 +23,7 @@ are made. The settings of a result stand in its `config.yaml`.
 
 `geogs run --help` and `geogs reconstruct --help` show the options in **bold**, `--help-all` all of
 them. Settings that only one of the two commands heeds say so, and the other does not offer them.
+No command offers those of Python only: presets set them, and programs may.
 Groups named `ablation` are there to be compared with.
 """
 
@@ -66,7 +67,8 @@ def _row(leaf: Leaf, run: Leaf | None, known_poses: Leaf | None) -> list[str]:
     if only is None and run is not None and known_poses is not None:
         changed = _code(default_text(known_poses))
         default += "" if changed == default else f", {changed} in `reconstruct`"
-    beside = f" (`{only.command}` only)" if only else ""
+    where = "Python" if only and only.command == "python" else _code(only.command if only else "")
+    beside = f" ({where} only)" if only else ""
     name = _code(leaf.name)
     name = f"**{name}**" if leaf.mark(Basic) or not leaf.group else name
     return [name, default, str(leaf.kind), leaf.help + beside]

@@ -45,7 +45,7 @@ def _is_there(name: str) -> bool:
 
 
 def test_settings_that_the_texts_name_exist() -> None:
-    known = list(chain(leaves(Config), leaves(ReconstructConfig)))
+    known = list(chain(leaves(Config, "run"), leaves(ReconstructConfig, "reconstruct")))
     options = {option for leaf in known for option in (*leaf.options, leaf.switch_off)}
     groups = {option.split(".")[0] for option in options if "." in option}
     named = set()

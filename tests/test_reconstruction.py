@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from called_commands import done
 from depth_scene import WORKING, make_scene, trace
 from geogs.application.result_settings import RemeshSettings
-from geogs.application.results.remesh import mesh_settings, remesh
+from geogs.application.results.revise import mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
@@ -30,15 +30,7 @@ from geogs.mapping.known_poses import depth_search
 from geogs.mapping.map_all import spread_order
 from geogs.mesh.mesh_file import read_mesh
 from geogs.reconstruction import Reconstruction
-from posed_scene import (
-    DEFAULT,
-    SMALL,
-    ball_and_wall,
-    depth_errors,
-    geogs,
-    surface_points,
-    vertices,
-)
+from posed_scene import DEFAULT, SMALL, ball_and_wall, depth_errors, geogs, surface_points, vertices
 
 pytestmark = pytest.mark.system
 

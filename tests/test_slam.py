@@ -16,7 +16,7 @@ import torch
 from called_commands import done
 from data_set_layouts import asl_truth, sensor_yaml
 from geogs.application.result_settings import RemeshSettings
-from geogs.application.results.remesh import mesh_settings, remesh
+from geogs.application.results.revise import mesh_settings, remesh
 from geogs.application.results.saved_result import load_result
 from geogs.cli import main as cli
 from geogs.evaluation.surfaces.surface import read_surface

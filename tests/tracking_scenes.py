@@ -94,10 +94,7 @@ def sideways(count: int, step: float = 0.025) -> list[np.ndarray]:
     """A path that moves sideways, swings and turns a little."""
     return [
         pose(
-            -0.5 + step * k,
-            0.05 * np.sin(0.3 * k),
-            0.1 * np.sin(0.11 * k),
-            0.1 * np.sin(0.13 * k),
+            -0.5 + step * k, 0.05 * np.sin(0.3 * k), 0.1 * np.sin(0.11 * k), 0.1 * np.sin(0.13 * k)
         )
         for k in range(count)
     ]

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from geogs.io.writers.map_file import load_map
     from geogs.pose_estimate import PoseEstimate
     from geogs.slam import Slam
-    from geogs.splat.render import render
-    from geogs.splat.vjp import render_vjp
+    from geogs.splat.render import render, render_vjp
     from geogs.types import Frame
     from geogs.world.disks import GaussianMap
 
@@ -62,7 +61,7 @@ _HOMES = {
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
-    "render_vjp": "geogs.splat.vjp",
+    "render_vjp": "geogs.splat.render",
     "run": "geogs.application.run_in_python",
     "save_slam": "geogs.application.slam_in_python",
     "slam_mesh": "geogs.application.slam_in_python",

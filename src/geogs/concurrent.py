@@ -26,7 +26,8 @@ class BackgroundTask:
 
     def wait(self) -> None:
         """Wait until the work is done; re-raises its exception once."""
-        work, self._work = self._work, None
+        work = self._work
+        self._work = None
         if work is not None:
             work.result()
 

@@ -1,4 +1,4 @@
-"""Safe reading of untrusted text, JSON and YAML files: plain, of bounded size, never executed.
+"""Safe reading of untrusted text, JSON, XML and YAML files: plain, of bounded size, never executed.
 
 No message about such a file repeats its content, so that nothing leaks from a file that was named
 by mistake or by somebody else's list.
@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from geogs.errors import InputError
 
@@ -25,13 +26,9 @@ LARGEST_SETTINGS = 1 << 17
 
 _NUMBER = re.compile(r"(\d+)\.\w+")
 """Names of numbered files, padded with zeros or not."""
-_DEEPEST = 50
-"""Deepest nesting of groups."""
 _LONGEST_MESSAGE = 200
 
-UNUSABLE = (
-    ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
-)  # fmt: skip
+UNUSABLE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 """Errors that invalid values in a document may cause."""
 
 
@@ -113,18 +110,34 @@ def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
         raise InputError(f"{path} is not a text file in UTF-8; is it another one?") from None
 
 
-def read_json(path: str | Path) -> Any:
+def read_json(path: str | Path, largest: int = LARGEST_DOCUMENT) -> Any:
     """Read a JSON file.
 
     Raises:
         InputError: as of ``read_text``, or it is damaged.
     """
-    text = read_text(path, LARGEST_DOCUMENT)
+    text = read_text(path, largest)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         at = f" after line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
         raise InputError(f"{path} is damaged or no JSON{at}; copy it again.") from None
+
+
+def read_xml(path: str | Path) -> Element:
+    """Read an XML file without definitions of entities, by which a few lines can mean billions.
+
+    Raises:
+        InputError: as of ``read_bytes``, or it is damaged.
+    """
+    data = read_bytes(path, LARGEST_DOCUMENT)
+    try:
+        # A zero byte is one of UTF-16, in which a definition would not be found.
+        if any(mark in data for mark in (b"<!DOCTYPE", b"<!ENTITY", b"\0")):
+            raise ParseError
+        return fromstring(data)
+    except (ParseError, ValueError, LookupError):
+        raise InputError(f"{path} is damaged or no plain XML; copy it again.") from None
 
 
 def read_yaml(path: str | Path) -> Any:
@@ -147,7 +160,8 @@ def yaml_value(text: str, name: str) -> Any:
         """
 
         def fetch_more_tokens(self) -> Any:
-            if self.flow_level + len(self.indents) > _DEEPEST:
+            # Deepest nesting of groups.
+            if self.flow_level + len(self.indents) > 50:
                 raise yaml.YAMLError
             return super().fetch_more_tokens()
 

@@ -22,8 +22,6 @@ MOST_IDS = 1 << 22
 """Largest id: tables have a row for each id up to it. At two keyframes a second, 24 days."""
 MOST_COUNTED = 1 << 53
 """Largest count: floats represent all whole numbers up to it."""
-_SQUARENESS = 1e-4
-"""Largest error of an element of R R^T."""
 
 
 class _Unbounded:
@@ -96,7 +94,8 @@ def _is_transform(T: Tensor, is_scaled: bool) -> bool:
     square = R @ R.mT
     scale = square[..., :1, :1] if is_scaled else square.new_ones(())
     error = (square / scale - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max()
-    is_rotation = bool(error < _SQUARENESS) and bool((torch.linalg.det(R) > 0).all())
+    # Largest error of an element of R R^T.
+    is_rotation = bool(error < 1e-4) and bool((torch.linalg.det(R) > 0).all())
     if T.shape[-1] == 3:
         return is_rotation
     last = T.new_tensor([0.0, 0.0, 0.0, 1.0])

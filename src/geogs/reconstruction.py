@@ -26,10 +26,6 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.map import MapTable
 
-OUTPUT_RATIO = 0.2
-"""Fraction of the time budget reserved for mesh and report until their time has been measured on a
-few views."""
-
 
 @dataclass(eq=False)
 class ReconstructionTable:
@@ -65,7 +61,9 @@ class Reconstruction:
         store = KeyframeTable.on(SampleGrid(camera, device), None, self.config.resident_keyframes)
         self._keyframes = store.new_set()
         self.stopwatch = Stopwatch()
-        self.budget = TimeBudget(budget, OUTPUT_RATIO)
+        # Fraction of the time budget reserved for mesh and report until their time has been
+        # measured on a few views.
+        self.budget = TimeBudget(budget, 0.2)
         self._poses: list[Float[Tensor, "4 4"]] = []
         """World-to-camera poses as given."""
         self._all: Trajectory | None = None
@@ -75,7 +73,8 @@ class Reconstruction:
         self._work_on(ReconstructionTable(MapTable.empty(device, self.config.seed), WORLD, []))
 
     def _work_on(self, table: ReconstructionTable) -> None:
-        config, self.table = self.config, table
+        config = self.config
+        self.table = table
         keyframes = self._keyframes.table
         self.mapper = Mapper(keyframes, config.mapping, config.seed, table=table.map)
         self._stage = PosedMapping(self.mapper, config.search, self.budget, config.seed)
@@ -134,10 +133,11 @@ class Reconstruction:
         try:
             with self.stopwatch("depth"):
                 self._stage.search(
-                    points, lambda f: progress("depth", f),
+                    points,
+                    lambda f: progress("depth", f),
                     None if more is None else lambda count_of: self._add_more(more, count_of),
                     self._all is not None,
-                )  # fmt: skip
+                )
         finally:
             if self.mapper.table.mapped:
                 with self.stopwatch("growing"):
@@ -254,7 +254,8 @@ class Reconstruction:
         return self._in_world(self.mapper.depth_maps(chosen))
 
     def _in_world(self, renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
-        unit, poses = self.table.frame.unit, self._poses
+        unit = self.table.frame.unit
+        poses = self._poses
         return OnDemand(
             renders, lambda r: replace(r, depth=r.depth * unit, T_cw=poses[r.keyframe_id])
         )

@@ -23,7 +23,8 @@ class SceneMask:
 
         Pixels of a straightened image that the lens did not see are not valid.
         """
-        view, fixed = keyframe.table.view_of(keyframe.id), self.fixed
+        view = keyframe.table.view_of(keyframe.id)
+        fixed = self.fixed
         if view is not None:
             fixed = self._straight(view)
         if not self.black_is_masked:

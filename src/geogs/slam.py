@@ -1,5 +1,6 @@
 """Dense monocular SLAM on one page: track, close loops, move the map, map; adjust all, refine."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,16 +9,14 @@ from jaxtyping import Bool
 
 from geogs.config import Config
 from geogs.errors import InputError
-from geogs.executors.deferred import Deferred
-from geogs.executors.in_order import InOrder
+from geogs.executors.in_order import Deferred, InOrder
 from geogs.executors.live import Live, urgent_stream
 from geogs.geometry.camera import Camera
+from geogs.geometry.given_pose import as_pose
 from geogs.gpu.installation import require_device
-from geogs.input_frame import input_frame
 from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
-from geogs.metric_scale import rescale, scale_by_odometry
 from geogs.pose_estimate import PoseEstimate
 from geogs.priors.monocular_prior import MonocularPrior
 from geogs.scene_mask import SceneMask
@@ -27,7 +26,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.segment_trackers import Segments
-from geogs.tracking.tracker import TrackResult
+from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import FoundFrames, Frame, MetricScale
 from geogs.world.grid import SampleGrid
 from geogs.world.world import World, check_world
@@ -79,7 +78,8 @@ class Slam(SlamOutput):
         maps_at_end = defers_map and not live and c.mapping.may_follow
         self.world = world or World(maps_at_end=maps_at_end)
         self.stopwatch = Stopwatch(self.world.times)
-        where, scene_mask = str(require_device(device)), SceneMask(mask, black_is_masked)
+        where = str(require_device(device))
+        scene_mask = SceneMask(mask, black_is_masked)
         stream = urgent_stream(where) if live else None
         with torch.cuda.stream(stream):
             grid = SampleGrid(camera.required_pinhole(), where)
@@ -112,7 +112,8 @@ class Slam(SlamOutput):
         frame = input_frame(image, timestamp, self.camera, world.frames, world.timestamp)
         with self.executor.frame():
             state = self.executor.track(frame, self.loops.recognise, self._advance)
-            world.frames, world.timestamp = world.frames + 1, frame.timestamp
+            world.frames = world.frames + 1
+            world.timestamp = frame.timestamp
             self.pose = self._estimate(state, frame.timestamp)
         return self.pose
 
@@ -121,7 +122,8 @@ class Slam(SlamOutput):
         with self.stopwatch("loops"):
             joined = self.loops.update(tracked, is_last)
         self._update_map()
-        final, world = (*tracked.finalized, *joined), self.world
+        final = (*tracked.finalized, *joined)
+        world = self.world
         world.unmapped.extend(final)
         lag = 0 if is_last else self.config.mapping.lag
         self.executor.map(world.unmapped, final, lag, tracked.active)
@@ -202,7 +204,15 @@ class Slam(SlamOutput):
     def rescale(self, scale: MetricScale) -> None:
         """Convert all lengths of poses, depths and map to metres."""
         self.settle()
-        rescale(self.world, self.segments.main.keyframes, scale)
+        world = self.world
+        keyframes = self.segments.main.keyframes
+        shrunk = torch.eye(4, dtype=torch.float64)
+        shrunk[:3, :3] /= scale.factor
+        keyframes.correct(keyframes.moved(shrunk))
+        known = world.uncertainty
+        if known is not None:
+            world.uncertainty = replace(known, position=scale.factor * known.position)
+        world.metric_scale = scale
         self._update_map()
 
     def to_metres(self) -> None:
@@ -213,3 +223,78 @@ class Slam(SlamOutput):
         scale = None if self.metric_scale else scale_by_odometry(self.segments.main)
         if scale is not None:
             self.rescale(scale)
+
+
+def scale_by_odometry(main: Tracker) -> MetricScale | None:
+    """Return the scale from odometry poses; None without, or in the gauge of a saved map."""
+    odometry = main.map.odometry
+    found = odometry.found
+    if found.scale is None or main.segment.fixed:
+        return None
+    drift = (odometry.config.drift**2 + found.deviation**2) ** 0.5
+    scale = found.scale
+    found.scale = 1.0
+    return MetricScale("poses beside the images", scale, drift)
+
+
+def input_frame(
+    image: Frame | np.ndarray | torch.Tensor,
+    timestamp: float | None,
+    camera: Camera,
+    index: int,
+    previous: float | None,
+) -> Frame:
+    """Make a frame from an image.
+
+    Args:
+        image: RGB, uint8, undistorted, of the camera's size; or a frame of a source, which has
+            checked it.
+        timestamp: seconds, later than ``previous``, the last frame's; ignored for a frame, which
+            has its own. If None, images come 30 times a second.
+        index: position in the stream.
+
+    Raises InputError if the image cannot be used.
+    """
+    if isinstance(image, Frame):
+        if image.pose is None:
+            return image
+        return replace(image, pose=replace(image.pose, T_cw=as_pose(image.pose.T_cw)))
+    if isinstance(image, torch.Tensor):
+        image = image.cpu().numpy()
+    if timestamp is None:
+        seconds = 0.0 if previous is None else previous + 1 / 30
+    else:
+        seconds = float(timestamp)
+    check_image(image, camera)
+    if not np.isfinite(seconds):
+        raise InputError("The time of an image is a finite number of seconds.")
+    if previous is not None and seconds <= previous:
+        raise InputError(
+            f"The image is of {seconds:g} s, the one before of {previous:g} s; times have to "
+            "increase."
+        )
+    return Frame(index, seconds, image)
+
+
+def check_image(image: object, camera: Camera) -> None:
+    """Raise InputError if something is no RGB image of a camera's size."""
+    if not isinstance(image, np.ndarray):
+        raise InputError("An image is an array, uint8 of height x width x 3 (RGB).")
+    if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
+        raise InputError(
+            "The image is grey; give RGB, as of cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)."
+        )
+    if image.ndim != 3 or image.shape[2] != 3:
+        shape = "x".join(map(str, image.shape))
+        raise InputError(f"The image is an array of {shape}; give height x width x 3 (RGB).")
+    if image.dtype != np.uint8:
+        raise InputError(
+            f"The image is of {image.dtype}; give uint8 in 0..255, as of "
+            "(255 * image).round().astype(numpy.uint8) where it is in 0..1."
+        )
+    if image.shape[:2] != (camera.height, camera.width):
+        height, width = image.shape[:2]
+        raise InputError(
+            f"The image is {width} x {height} pixels, the camera {camera.width} x "
+            f"{camera.height}; all images must have the camera's size."
+        )

@@ -19,7 +19,7 @@ from geogs.mapping.rendered import MapRenderer, RenderedView
 from geogs.pose_estimate import PoseEstimate
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.frames.straight_rows import straight_rows
+from geogs.tracking.frames.seen_rows import straight_rows
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.segment_trackers import Segments
 from geogs.types import (
@@ -123,6 +123,8 @@ class SlamOutput:
     def statistics(self) -> dict[str, object]:
         """Return statistics of segments, loops and moving objects for the summary, as JSON."""
         self.settle()
+        records = self.segments.main.map.recorder.log.records
+        found = sum(record.is_found for record in records)
         return {
             "refined": self.world.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
@@ -130,17 +132,11 @@ class SlamOutput:
             "lens": None if self.lens is None else asdict(self.lens),
             "moving": round(dynamic_fraction(self.segments.main.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
-            **self._placed_afterwards(),
+            **({"placed_afterwards": found} if found else {}),
             "not_started": self.world.segments.why_not or None,
             "loops": len(self.world.loops.loops),
             "loop_closures": self.world.loops.closures,
         }
-
-    def _placed_afterwards(self) -> dict[str, object]:
-        """Return the number of frames relocalised after the stream; empty where there are none."""
-        records = self.segments.main.map.recorder.log.records
-        found = sum(record.is_found for record in records)
-        return {"placed_afterwards": found} if found else {}
 
     def _pose_agreement(self) -> dict[str, object] | None:
         """Return the agreement of odometry poses with the images; None where there are none."""
@@ -156,7 +152,8 @@ class SlamOutput:
     def rows(self) -> dict[int, SeenRows]:
         """Return the :class:`SeenRows` of rectified keyframes, by id."""
         segment = self.segments.main.segment
-        known, view_of = segment.frames.rows, segment.keyframes.table.view_of
+        known = segment.frames.rows
+        view_of = segment.keyframes.table.view_of
         seen = [(k.id, known[k.frame_index]) for k in segment.keyframes if k.frame_index in known]
         views = {id: view for id, _ in seen if (view := view_of(id)) is not None}
         return {id: straight_rows(r, views[id]) if id in views else r for id, r in seen}
@@ -207,5 +204,6 @@ class SlamOutput:
         T_cw = self.T_cw if in_main else None
         if T_cw is None:
             return PoseEstimate(state, *counts, timestamp)
-        pose, deviation = T_cw.detach().double().cpu().clone(), self.executor.deviation()
+        pose = T_cw.detach().double().cpu().clone()
+        deviation = self.executor.deviation()
         return PoseEstimate(state, *counts, timestamp, pose.numpy(), deviation)

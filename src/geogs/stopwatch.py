@@ -67,7 +67,8 @@ class Stopwatch:
         if self._is_running or self._here.is_aside:
             yield
             return
-        self._is_running, start = True, time.perf_counter()
+        self._is_running = True
+        start = time.perf_counter()
         try:
             yield
         finally:
@@ -77,7 +78,8 @@ class Stopwatch:
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Context in which this thread adds nothing: it works beside the one that is timed."""
-        before, self._here.is_aside = self._here.is_aside, True
+        before = self._here.is_aside
+        self._here.is_aside = True
         try:
             yield
         finally:

@@ -9,7 +9,6 @@ this module, and PyTorch is limited to one while they work.
 import functools
 import itertools
 import os
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -49,7 +48,8 @@ def thread_map(
     of ``progress``, items that have not begun are skipped.
     """
     results: dict[int, R] = {}
-    caller, reported = threading.get_ident(), 0
+    caller = threading.get_ident()
+    reported = 0
 
     def report() -> None:
         nonlocal reported
@@ -102,7 +102,8 @@ def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> 
     The caller's thread takes part. After an exception, chunks that have not begun are skipped; it
     is raised once all threads are done. Nested calls share the threads.
     """
-    counter, failed = itertools.count(), False
+    counter = itertools.count()
+    failed = False
 
     def work() -> None:
         nonlocal failed
@@ -139,9 +140,8 @@ def over_rows(kernel: Callable[[int, int], object], height: int) -> None:
 def _executor(threads: int, process: int) -> ThreadPoolExecutor:
     """Return one pool per process: threads do not survive a fork. Each has one PyTorch thread."""
     return ThreadPoolExecutor(
-        threads - 1, thread_name_prefix="geogs",
-        initializer=torch.set_num_threads, initargs=(1,),
-    )  # fmt: skip
+        threads - 1, thread_name_prefix="geogs", initializer=torch.set_num_threads, initargs=(1,)
+    )
 
 
 def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:
@@ -164,22 +164,3 @@ def opencv_on_one_thread() -> None:
     import cv2
 
     cv2.setNumThreads(1)
-
-
-SWITCH_SECONDS = 0.0001
-"""Switch interval of Python's threads while tracking and mapping share the interpreter. The usual
-5 ms, several times a frame, would slow tracking."""
-
-
-class QuickSwitching:
-    """Shortens the switch interval from ``begin`` to ``end``: process-wide, for live systems."""
-
-    def begin(self) -> "QuickSwitching":
-        """Shorten the interval."""
-        self._before = sys.getswitchinterval()
-        sys.setswitchinterval(min(SWITCH_SECONDS, self._before))
-        return self
-
-    def end(self) -> None:
-        """Restore the interval."""
-        sys.setswitchinterval(self._before)

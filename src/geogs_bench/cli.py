@@ -26,6 +26,8 @@ def main(argv: Sequence[str]) -> int:
         return 0
     if options.name == "board":
         return _board(options)
+    if options.name == "sensitivity":
+        return _sensitivity(options)
     done = bench(options, lambda text: print(text, file=sys.stderr, flush=True))
     for table in _tables(done):
         Console().print(table)
@@ -37,13 +39,23 @@ def main(argv: Sequence[str]) -> int:
 def _board(options: BenchOptions) -> int:
     """Run the board; return 2 if a command failed, 1 if a figure got worse, else 0."""
     from geogs_bench.board.board import board
-    from geogs_bench.board.board_table import markdown
+    from geogs_bench.board.comparison import markdown
 
     done, changes = board(options, lambda text: print(text, file=sys.stderr, flush=True))
     print(markdown(done, changes), end="")
     if any(row.failures for row in done.rows):
         return 2
     return 1 if any(change.is_worse for change in changes) else 0
+
+
+def _sensitivity(options: BenchOptions) -> int:
+    """Halve and double constants on the board."""
+    from geogs_bench.board.sensitivity import sensitivity, table
+
+    print(
+        table(sensitivity(options, lambda text: print(text, file=sys.stderr, flush=True))), end=""
+    )
+    return 0
 
 
 def _tables(done: "BenchResult") -> "list[Table]":

@@ -1,34 +1,104 @@
 """Runs and scores the jobs of a benchmark; a job that fails does not affect the others."""
 
+import hashlib
+import json
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from geogs.errors import GeogsError
+from geogs.documents import UNUSABLE, read_json
+from geogs.errors import GeogsError, InputError
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.machine import forget_peak_memory, machine_name, program_version
 from geogs_bench.plan import BenchmarkJob
-from geogs_bench.results.record import Cost, Provenance, Record, read_record, write_json
-from geogs_bench.results.result_folder import ResultFolder
-from geogs_bench.results.store import (
-    RECORD_FILE,
-    CompletedRun,
-    clear,
-    completed_run,
-    config_hash,
-    records_below,
-    write_completed_run,
+from geogs_bench.results.record import (
+    Cost,
+    Provenance,
+    Record,
+    read_dataclass,
+    read_record,
+    write_json,
 )
+from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.runners.runner import Runner
+from geogs_bench.runners.task import Command
 from geogs_bench.scoring.scores import scored
 from geogs_bench.tables.benchmark_report import Chapter, write_report
 
 _ERROR_FILE = "bench_error.txt"
+
+
+RECORD_FILE = "bench.json"
+"""The record of the result."""
+
+_RUN_FILE = "bench_run.json"
+_LEFT_BY_EARLIER_RUNS = (
+    _RUN_FILE, RECORD_FILE, "mesh.ply", "map.safetensors", "summary.json", "online/trajectory.tum",
+    "online/keyframes.tum", "online/mesh.ply", "adjusted/trajectory.tum",
+    "adjusted/keyframes.tum", "adjusted/mesh.ply", "depth_fusion/mesh.ply", "snapshots/*/mesh.ply",
+    "snapshots/*/map.safetensors",
+)  # fmt: skip
+"""Files of an earlier result that would be scored."""
+
+
+@dataclass(frozen=True)
+class CompletedRun:
+    """A complete run: its source, provenance and cost."""
+
+    source: str
+    provenance: Provenance
+    cost: Cost
+
+
+def config_hash(command: Command, settings: Mapping[str, object]) -> str:
+    """Twelve digits that change with any setting."""
+    text = json.dumps([command, settings], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def completed_run(folder: Path, source: Path, digest: str) -> CompletedRun | None:
+    """The run in a folder, if it is of this source with these settings."""
+    try:
+        run = read_dataclass(CompletedRun, read_json(folder / _RUN_FILE))
+    except (InputError, *UNUSABLE):
+        return None
+    if not isinstance(run.provenance, Provenance):
+        return None
+    fits = run.source == str(source.resolve()) and run.provenance.config_hash == digest
+    return run if fits else None
+
+
+def write_completed_run(folder: Path, run: CompletedRun) -> None:
+    """Mark the folder's run as complete. Raises OutputError if that fails."""
+    write_json(folder / _RUN_FILE, run)
+
+
+def clear(folder: Path) -> Path:
+    """Prepare the folder for a new run: delete the files of an earlier one that would be scored.
+
+    No other file is touched, and no link to another folder is followed.
+
+    Raises:
+        OutputError: it cannot be made or written.
+    """
+    prepare_output_folder(folder)
+    for pattern in _LEFT_BY_EARLIER_RUNS:
+        for path in folder.glob(pattern):
+            if path.parent.resolve() == folder.resolve() / path.parent.relative_to(folder):
+                path.unlink()
+    return folder
+
+
+def records_below(output: Path, benchmark: str) -> list[Record]:
+    """The records of a benchmark in the folders of its results."""
+    files = [*output.glob(f"*/{RECORD_FILE}"), *output.glob(f"*/*/{RECORD_FILE}")]
+    records = [record for path in sorted(files) if (record := read_record(path)) is not None]
+    return [record for record in records if record.benchmark == benchmark]
 
 
 class Harness:
@@ -54,9 +124,7 @@ class Harness:
         self._machine = machine_name()
 
     def run(
-        self,
-        jobs: Sequence[BenchmarkJob],
-        report: Callable[[list[Record]], None] | None = None,
+        self, jobs: Sequence[BenchmarkJob], report: Callable[[list[Record]], None] | None = None
     ) -> list[Record]:
         """Run jobs; return all records of the benchmark, with those of earlier calls in the folder.
 
@@ -161,9 +229,13 @@ def score_given(
     summary = result.summary
     seconds = float(summary.get("seconds", {}).get("total", 0.0))
     provenance = Provenance(
-        benchmark.command, str(summary.get("versions", {}).get("geogs", "")), machine_name(),
-        str(summary.get("device", "")), int(summary.get("seed", 0)), "",
-    )  # fmt: skip
+        benchmark.command,
+        str(summary.get("versions", {}).get("geogs", "")),
+        machine_name(),
+        str(summary.get("device", "")),
+        int(summary.get("seed", 0)),
+        "",
+    )
     record = Record(benchmark.name, scene.name, "", str(result.path), provenance)
     record = scored(replace(record, cost=cost_of(result, seconds)), scene, result)
     write_report(output, benchmark.title, [Chapter(benchmark, [record])])

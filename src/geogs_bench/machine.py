@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import platform
+import re
 import subprocess
 from contextlib import suppress
 from pathlib import Path
@@ -14,17 +15,11 @@ from geogs.version import __version__
 
 def machine_name() -> str:
     """Processor and the number of cores that may be used."""
-    return f"{_processor()}, {available_cores()} cores"
-
-
-def first_processor() -> dict[str, str]:
-    """Properties of the first processor, by the names in /proc/cpuinfo; empty without Linux."""
-    said = dict[str, str]()
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            name, _, value = line.partition(":")
-            said.setdefault(name.strip(), value.strip())
-    return said
+    processor = platform.processor() or platform.machine()
+    with suppress(OSError):  # Linux alone has this file
+        found = re.search(r"^model name\s*: *(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
+        processor = found[1].strip() if found else processor
+    return f"{processor}, {available_cores()} cores"
 
 
 def program_version() -> str:
@@ -55,17 +50,16 @@ def forget_peak_memory() -> None:
         torch.cuda.reset_peak_memory_stats()
 
 
-def _processor() -> str:
-    return first_processor().get("model name") or platform.processor() or platform.machine()
-
-
 def _git(folder: Path, *arguments: str) -> str | None:
     """Output of a git command; none if it fails or git is missing."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), *arguments],
-            capture_output=True, text=True, check=True, timeout=20,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=20,
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()

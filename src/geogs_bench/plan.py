@@ -71,12 +71,15 @@ def make_jobs(
             f"{benchmark.name} has no variant {missing[0]}, only {', '.join(known) or 'one'}."
         )
     chosen = [v for v in variants if v.name in selection.variants or not selection.variants]
-    jobs = [
-        _job(benchmark, scene, v, output, selection)
-        for scene in scenes
-        for v in chosen
-        if scene.has_depth or not v.needs_depth
-    ]
+    jobs = []
+    for scene in scenes:
+        for variant in chosen:
+            if scene.has_depth or not variant.needs_depth:
+                options = merged(scene.options, selection.options, variant.options)
+                command = variant.command or benchmark.command
+                folder = output / scene.name / variant.name
+                task = Task(command, scene.source, folder, options)
+                jobs.append(BenchmarkJob(scene, variant.name, task))
     if not jobs and scenes:
         names = ", ".join(v.name for v in chosen)
         raise InputError(f"No scene has depth images, which {names} needs.")
@@ -97,40 +100,19 @@ def variants_of(benchmark: Benchmark, selection: Selection) -> list[Variant]:
     if selection.baseline:
         command: Command = "colour-2dgs"
         variants.append(Variant(command, command=command))
-    several = len(budgets) > 1
-    return [
-        replace(
-            variant,
-            name=_timed(variant.name, seconds) if several or not variant.name else variant.name,
-            options=(*variant.options, Option("budget", f"{seconds:g}s")),
-        )
-        for variant in variants
-        for seconds in budgets
-    ]
-
-
-def _timed(name: str, seconds: float) -> str:
-    return f"{name}-{seconds:g}s" if name else f"{seconds:g}s"
-
-
-def _job(
-    benchmark: Benchmark,
-    scene: BenchmarkScene,
-    variant: Variant,
-    output: Path,
-    selection: Selection,
-) -> BenchmarkJob:
-    options = merged(scene.options, selection.options, variant.options)
-    folder = output / scene.name / variant.name
-    command = variant.command or benchmark.command
-    return BenchmarkJob(scene, variant.name, Task(command, scene.source, folder, options))
+    timed = []
+    for variant in variants:
+        for seconds in budgets:
+            budget = f"{seconds:g}s"
+            name = variant.name
+            if len(budgets) > 1 or not name:
+                name = f"{name}-{budget}".removeprefix("-")
+            options = (*variant.options, Option("budget", budget))
+            timed.append(replace(variant, name=name, options=options))
+    return timed
 
 
 def merged(*groups: Sequence[Option]) -> tuple[Option, ...]:
     """All options, each once; later ones win."""
-    by_name = {
-        option.name.replace("_", "-"): replace(option, name=option.name.replace("_", "-"))
-        for group in groups
-        for option in group
-    }
-    return tuple(by_name.values())
+    values = {option.name.replace("_", "-"): option.value for group in groups for option in group}
+    return tuple(Option(name, value) for name, value in values.items())

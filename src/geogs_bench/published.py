@@ -45,7 +45,8 @@ class PublishedTable:
 
     def mean(self, columns: Iterable[str], metric: str, method: str = PAPER) -> float | None:
         """The printed mean, or the mean over ``columns`` if these are only part of the table."""
-        row, kept = self._row(metric, method), set(columns)
+        row = self._row(metric, method)
+        kept = set(columns)
         if row is None:
             return None
         if row.mean is not None and kept.issuperset(self.columns):
@@ -67,9 +68,12 @@ def _three(method: str, *rows: tuple[float, ...]) -> tuple[PublishedRow, ...]:
     )
 
 
-REPLICA_SCENES = (
-    "room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4",
-)  # fmt: skip
+def _by_method(metric: str, printed: dict[str, tuple[float, ...]]) -> tuple[PublishedRow, ...]:
+    """Rows of one metric; the last value of each is the mean."""
+    return tuple(PublishedRow(name, metric, v[:-1], v[-1]) for name, v in printed.items())
+
+
+REPLICA_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 
 REPLICA_SURFACE = PublishedTable(
     "tab:replica_recon",
@@ -125,14 +129,18 @@ REPLICA_TRACKING = PublishedTable(
     "tab:replica_tracking",
     "Online tracking on Replica, mean ATE over eight sequences in cm",
     ("mean",),
-    tuple(
-        PublishedRow(method, "ATE", (value,), value)
-        for method, value in (
-            ("DROID-SLAM", 0.38), ("MGS-SLAM", 0.32), ("Splat-SLAM*", 0.38),
-            ("HI-SLAM2*", 0.32), ("GSO-SLAM", 0.46), (PAPER, 0.28),
-        )
+    _by_method(
+        "ATE",
+        {
+            "DROID-SLAM": (0.38, 0.38),
+            "MGS-SLAM": (0.32, 0.32),
+            "Splat-SLAM*": (0.38, 0.38),
+            "HI-SLAM2*": (0.32, 0.32),
+            "GSO-SLAM": (0.46, 0.46),
+            PAPER: (0.28, 0.28),
+        },
     ),
-)  # fmt: skip
+)
 
 SCANNETPP_SCENES = ("8b5caf3398", "39f36da05b", "6d89a7320d", "fb564c935d")
 
@@ -157,16 +165,16 @@ SCANNET = PublishedTable(
     "tab:scannet_tracking",
     "Online tracking on ScanNet, ATE in cm",
     SCANNET_SCENES,
-    tuple(
-        PublishedRow(method, "ATE", values[:-1], values[-1])
-        for method, values in (
-            ("NICE-SLAM", (12.00, 20.90, 14.00, 7.90, 10.90, 13.40, 6.20, 9.00, 11.8)),
-            ("E-SLAM", (7.30, 36.30, 8.50, 7.50, 6.50, 9.00, 5.70, 4.30, 10.6)),
-            ("GLORIE-SLAM", (5.50, 9.40, 9.10, 7.00, 8.20, 8.30, 7.50, 5.10, 7.50)),
-            ("Splat-SLAM", (5.57, 9.50, 9.11, 7.09, 8.26, 8.39, 7.53, 5.17, 7.58)),
-            ("HI-SLAM2*", (5.20, 8.50, 8.27, 7.58, 8.01, 6.87, 6.90, 5.15, 7.06)),
-            (PAPER, (5.20, 8.47, 8.25, 7.13, 8.00, 6.86, 6.89, 5.21, 7.00)),
-        )
+    _by_method(
+        "ATE",
+        {
+            "NICE-SLAM": (12.00, 20.90, 14.00, 7.90, 10.90, 13.40, 6.20, 9.00, 11.8),
+            "E-SLAM": (7.30, 36.30, 8.50, 7.50, 6.50, 9.00, 5.70, 4.30, 10.6),
+            "GLORIE-SLAM": (5.50, 9.40, 9.10, 7.00, 8.20, 8.30, 7.50, 5.10, 7.50),
+            "Splat-SLAM": (5.57, 9.50, 9.11, 7.09, 8.26, 8.39, 7.53, 5.17, 7.58),
+            "HI-SLAM2*": (5.20, 8.50, 8.27, 7.58, 8.01, 6.87, 6.90, 5.15, 7.06),
+            PAPER: (5.20, 8.47, 8.25, 7.13, 8.00, 6.86, 6.89, 5.21, 7.00),
+        },
     ),
 )
 
@@ -183,17 +191,17 @@ TUM_RGBD = PublishedTable(
         "rgbd_dataset_freiburg2_xyz",
         "rgbd_dataset_freiburg3_long_office_household",
     ),
-    tuple(
-        PublishedRow(method, "ATE", values[:-1], values[-1])
-        for method, values in (
-            ("Kintinuous", (3.70, 7.10, 7.50, 2.90, 3.00, 4.84)),
-            ("ElasticFusion", (2.53, 6.83, 21.49, 1.17, 2.52, 6.91)),
-            ("ORB-SLAM2", (1.60, 2.20, 4.70, 0.40, 1.00, 1.98)),
-            ("NICE-SLAM", (4.26, 4.99, 34.49, 31.73, 3.87, 15.87)),
-            ("Vox-Fusion", (3.52, 6.00, 19.53, 1.49, 26.01, 11.31)),
-            ("Point-SLAM", (4.34, 4.54, 30.92, 1.31, 3.48, 8.92)),
-            ("SplaTAM", (3.35, 6.54, 11.13, 1.24, 5.16, 5.48)),
-        )
+    _by_method(
+        "ATE",
+        {
+            "Kintinuous": (3.70, 7.10, 7.50, 2.90, 3.00, 4.84),
+            "ElasticFusion": (2.53, 6.83, 21.49, 1.17, 2.52, 6.91),
+            "ORB-SLAM2": (1.60, 2.20, 4.70, 0.40, 1.00, 1.98),
+            "NICE-SLAM": (4.26, 4.99, 34.49, 31.73, 3.87, 15.87),
+            "Vox-Fusion": (3.52, 6.00, 19.53, 1.49, 26.01, 11.31),
+            "Point-SLAM": (4.34, 4.54, 30.92, 1.31, 3.48, 8.92),
+            "SplaTAM": (3.35, 6.54, 11.13, 1.24, 5.16, 5.48),
+        },
     ),
     "SplaTAM (Keetha et al., CVPR 2024)",
 )
@@ -206,18 +214,18 @@ DTU = PublishedTable(
     "tab:dtu_main",
     "Chamfer distance on DTU after 2 minutes; the paper prints cm, the protocol gives mm",
     DTU_SCENES,
-    tuple(
-        PublishedRow(method, "CD", values[:-1], values[-1])
-        for method, values in (
-            ("2DGS", (1.29, 1.18, 1.22, 0.83, 2.43, 2.03, 1.19, 1.54, 1.53, 1.20, 1.09, 2.05,
-                      1.07, 1.04, 1.04, 1.38)),
-            ("PGSR", (2.22, 1.78, 2.56, 2.72, 3.66, 2.77, 1.88, 1.09, 1.80, 2.42, 0.75, 3.08,
-                      2.89, 0.97, 0.49, 2.07)),
-            ("QGS", (2.15, 1.34, 1.65, 1.45, 2.75, 2.33, 1.49, 1.32, 1.94, 1.20, 1.85, 2.27,
-                     1.81, 1.26, 1.18, 1.73)),
-            (PAPER, (0.53, 0.89, 0.36, 0.34, 0.96, 0.66, 0.56, 1.25, 0.96, 0.62, 0.46, 0.62,
-                     0.34, 0.42, 0.41, 0.62)),
-        )
+    _by_method(
+        "CD",
+        {
+            "2DGS": (1.29, 1.18, 1.22, 0.83, 2.43, 2.03, 1.19, 1.54, 1.53, 1.20, 1.09, 2.05,
+                      1.07, 1.04, 1.04, 1.38),
+            "PGSR": (2.22, 1.78, 2.56, 2.72, 3.66, 2.77, 1.88, 1.09, 1.80, 2.42, 0.75, 3.08,
+                      2.89, 0.97, 0.49, 2.07),
+            "QGS": (2.15, 1.34, 1.65, 1.45, 2.75, 2.33, 1.49, 1.32, 1.94, 1.20, 1.85, 2.27,
+                     1.81, 1.26, 1.18, 1.73),
+            PAPER: (0.53, 0.89, 0.36, 0.34, 0.96, 0.66, 0.56, 1.25, 0.96, 0.62, 0.46, 0.62,
+                     0.34, 0.42, 0.41, 0.62),
+        },
     ),
 )  # fmt: skip
 
@@ -228,12 +236,14 @@ DTU_EFFICIENCY = PublishedTable(
     tuple(
         PublishedRow(method, metric, (value,))
         for method, values in (
-            ("2DGS", (161.0, 37.5, 0.83)), ("PGSR", (231.0, 54.6, 2.72)),
-            ("QGS", (200.0, 8.1, 1.45)), (PAPER, (23.0, 1.2, 0.34)),
+            ("2DGS", (161.0, 37.5, 0.83)),
+            ("PGSR", (231.0, 54.6, 2.72)),
+            ("QGS", (200.0, 8.1, 1.45)),
+            (PAPER, (23.0, 1.2, 0.34)),
         )
         for metric, value in zip(("thousand disks", "MB", "CD"), values, strict=True)
     ),
-)  # fmt: skip
+)
 
 ABLATION_INIT = PublishedTable(
     "tab:ablation_init",

@@ -7,22 +7,27 @@ import json
 import os
 import pickle
 import platform
+import shutil
 import signal
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 from geogs.application.run_settings import RunSettings
-from geogs.errors import GeogsError
+from geogs.errors import GeogsError, InputError, OutputError
 from geogs.evaluation.duration import duration
-from geogs_fleet.row import FILE, Row, State, numbers_of, row_text
 from geogs_fleet.sources import FleetSource
 from geogs_fleet.storage import StoragePath
 from geogs_fleet.supervise import Limits, ProcessEnd, supervise
-from geogs_fleet.work_folder import WorkFolder, fetched
+from geogs_fleet.table import FILE, Row, State, numbers_of, row_text
 
 LOG = "run.log"
+_MANIFEST = "manifest.json"  # of geogs.application.checkpoints.folder, which loads PyTorch
 CHILD = (sys.executable, "-m", "geogs_fleet.child")
 
 
@@ -50,19 +55,27 @@ def attempt(job: FleetJob) -> Row:
     """
     begin = time.monotonic()
     state: State = "failed"
+    summary: dict[str, Any] = {}
     try:
         state, sentence, summary = _attempt(job)
     except GeogsError as error:
-        sentence, summary = str(error), {}
+        sentence = str(error)
     except Exception as error:
-        sentence, summary = f"The attempt failed ({type(error).__name__}: {error}).", {}
+        sentence = f"The attempt failed ({type(error).__name__}: {error})."
     judgement = summary.get("verdict")
     verdict: dict[str, Any] = judgement if isinstance(judgement, dict) else {}
     row = Row(
-        job.source.name, job.source.address, state, verdict.get("sentence", sentence), job.digest,
-        verdict.get("is_reliable"), round(time.monotonic() - begin, 3), job.attempt,
-        platform.node(), numbers_of(summary),
-    )  # fmt: skip
+        job.source.name,
+        job.source.address,
+        state,
+        verdict.get("sentence", sentence),
+        job.digest,
+        verdict.get("is_reliable"),
+        round(time.monotonic() - begin, 3),
+        job.attempt,
+        platform.node(),
+        numbers_of(summary),
+    )
     if state == "done":
         try:
             (StoragePath(job.output) / FILE).write(row_text(row))
@@ -121,3 +134,75 @@ def judged(ending: ProcessEnd, limits: Limits, log: str) -> tuple[State, str]:
             name = f"signal {-ending.code}"
         return "crashed", f"The process was ended by {name}; is the memory of the machine full?"
     return "failed", f"The run broke off by an error of the program; {log} says where."
+
+
+class WorkFolder:
+    """The folder of one source's results for a run on this node.
+
+    With an output on a local path, the run works there. Otherwise it works in a temporary folder,
+    and every new checkpoint and the results are copied; a checkpoint's manifest is copied last, so
+    that an incomplete one is recognised as damaged.
+    """
+
+    def __init__(self, place: StoragePath) -> None:
+        self._place = place
+        mark = sha256(place.address.encode("utf-8", "backslashreplace")).hexdigest()[:16]
+        # The same path on every node: a checkpoint stores the path of its source.
+        self.scratch = Path(tempfile.gettempdir()) / f"geogs-fleet-{os.getuid()}" / mark
+        self.path = place.path or self.scratch / "result"
+        self._kept: tuple[int, int] | None = None
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{self.path} cannot be written ({reason}).") from error
+        if place.path is None:
+            shutil.rmtree(self.path / "checkpoint", ignore_errors=True)
+            previous = place / "checkpoint"
+            if _MANIFEST in previous.listed():
+                previous.download(self.path / "checkpoint")
+
+    def keep_checkpoint(self) -> None:
+        """Copy the checkpoint to the output, if it is new."""
+        if self._place.path is not None:
+            return
+        manifest = self.path / "checkpoint" / _MANIFEST
+        try:
+            status = manifest.stat()
+            if (status.st_mtime_ns, status.st_ino) == self._kept:
+                return
+            files = [path for path in manifest.parent.iterdir() if path.name[0] != "."]
+            files.sort(key=lambda path: path.name == _MANIFEST)
+            for path in files:
+                (self._place / f"checkpoint/{path.name}").upload(path)
+            self._kept = (status.st_mtime_ns, status.st_ino)
+        except (OSError, OutputError):  # the next one may succeed
+            return
+
+    def keep(self, files: list[Path]) -> None:
+        """Copy files of the folder to the output. Raises OutputError if that fails."""
+        if self._place.path is None:
+            for path in files:
+                (self._place / path.relative_to(self.path).as_posix()).upload(path)
+
+    def leave(self) -> None:
+        """Remove temporary files and checkpoints after success."""
+        if self._place.path is None:
+            previous = self._place / "checkpoint"
+            for name in previous.listed():
+                (previous / name).delete()
+        shutil.rmtree(self.scratch, ignore_errors=True)
+
+
+def fetched(source: FleetSource, scratch: Path) -> Path:
+    """Download a source from elsewhere. Raises InputError if that fails."""
+    place = StoragePath(source.address)
+    target = scratch / "source" / (place.name or "source")
+    if not target.exists():
+        unfinished = target.with_name(f"{target.name}.{token_hex(6)}.part")
+        place.download(unfinished)
+        try:
+            os.replace(unfinished, target)
+        except OSError as error:
+            raise InputError(f"{target} cannot be written ({error.strerror}).") from error
+    return target

@@ -27,12 +27,13 @@ def main(argv: Sequence[str]) -> int:
             )
         words = words[1:]
     options = parse(words)
+    config_on_gpu = parse(words, on_gpu=True).config
 
+    from geogs_fleet.fleet_progress import TerminalFleet, closing_message
     from geogs_fleet.fleet_run import run_fleet
-    from geogs_fleet.fleet_terminal import TerminalFleet, closing_message
 
     begin = time.perf_counter()
-    result = run_fleet(options, TerminalFleet(options.quiet))
+    result = run_fleet(options, TerminalFleet(options.quiet), config_on_gpu=config_on_gpu)
     seconds = time.perf_counter() - begin
     if not options.quiet:
         print(closing_message(result.rows, result.computed, result.output, seconds))
@@ -41,30 +42,33 @@ def main(argv: Sequence[str]) -> int:
 
 def _join(words: Sequence[str]) -> int:
     options = _parsed(JoinOptions, words, "fleet join")
+    config_on_gpu = _parsed(JoinOptions, words, "fleet join", on_gpu=True).config
 
-    from geogs_fleet.fleet_terminal import TerminalFleet
+    from geogs_fleet.fleet_progress import TerminalFleet
     from geogs_fleet.join_run import run_join
 
     progress = TerminalFleet(options.quiet)
-    joint = run_join(options, progress, progress.say)
+    joint = run_join(options, progress, progress.say, config_on_gpu)
     if not options.quiet:
         print(f"{joint.sentence}\nOpen {joint.output}/report/index.html in a browser.")
     return EXIT_FAILED if joint.unjoined else 0
 
 
-def parse(argv: Sequence[str]) -> FleetOptions:
-    """Parse options, over those of a preset.
+def parse(argv: Sequence[str], on_gpu: bool = False) -> FleetOptions:
+    """Parse options, over those of a preset for the CPU or for a GPU.
 
     Raises:
         SystemExit: after ``--help``.
         InputError: an option is wrong or missing.
     """
-    return _parsed(FleetOptions, argv, "fleet run")
+    return _parsed(FleetOptions, argv, "fleet run", on_gpu)
 
 
-def _parsed(kind: type[Options], argv: Sequence[str], command: str) -> Options:
+def _parsed(
+    kind: type[Options], argv: Sequence[str], command: str, on_gpu: bool = False
+) -> Options:
     def defaults(given: Given) -> Options:
         name = cast(Preset, given.get("preset", "default"))
-        return kind(config=preset(name), preset=name)
+        return kind(config=preset(name, on_gpu), preset=name)
 
     return parse_options(kind, argv, command, defaults)

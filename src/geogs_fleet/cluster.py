@@ -71,10 +71,9 @@ def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
     cpus = 1
     if settings.cpus != "auto":
         cpus = settings.cpus
-    else:
-        if gpus:
-            parts = [n.get("CPU", 0.0) * gpus / n["GPU"] for n in nodes if n.get("GPU", 0.0)]
-            cpus = max(1, min(16, int(min(parts, default=1.0))))
+    elif gpus:
+        parts = [n.get("CPU", 0.0) * gpus / n["GPU"] for n in nodes if n.get("GPU", 0.0)]
+        cpus = max(1, min(16, int(min(parts, default=1.0))))
     memory = settings.memory_limit
     memory_bytes = None if memory is None else int(memory * 2**30)
     wanted = {"CPU": float(cpus), "GPU": gpus, "memory": float(memory_bytes or 0)}

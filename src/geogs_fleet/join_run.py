@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from geogs.application.results.output_folder import claimed
 from geogs.cli.options import record
+from geogs.config import Config
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs_fleet.cluster import allocation_for, ray_cluster
@@ -29,8 +30,11 @@ def run_join(
     settings: JoinOptions,
     progress: FleetProgress | None = None,
     say: Callable[[str], None] = lambda sentence: None,
+    config_on_gpu: Config | None = None,
 ) -> "Joint":
     """Run the parts that are no results yet, and join all of them.
+
+    ``config_on_gpu`` replaces the settings' own ``config`` where there are GPUs.
 
     Raises:
         InputError: a part is unusable, no two of them overlap, or Ray is missing.
@@ -41,6 +45,8 @@ def run_join(
         raise InputError("The joint result needs a folder that all machines see; give one (-o).")
     with claimed(path.absolute()) as output, ray_cluster(settings.address) as ray:
         allocation = allocation_for(ray, settings)
+        if allocation.gpus and config_on_gpu is not None:
+            settings = replace(settings, config=config_on_gpu)
         parts = _parts(settings, output, progress, say)
 
         from geogs_fleet.join.join import join_parts
@@ -51,10 +57,7 @@ def run_join(
 
 
 def _parts(
-    settings: JoinOptions,
-    output: Path,
-    progress: FleetProgress | None,
-    say: Callable[[str], None],
+    settings: JoinOptions, output: Path, progress: FleetProgress | None, say: Callable[[str], None]
 ) -> "list[Part]":
     """The results to join, in the order of their names on the command line."""
     from geogs_fleet.join.part import Part

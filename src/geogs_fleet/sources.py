@@ -10,10 +10,7 @@ from pathlib import Path, PurePosixPath
 from geogs.errors import InputError
 from geogs_fleet.storage import StoragePath
 
-VIDEOS = frozenset({
-    ".3gp", ".avi", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
-    ".webm", ".wmv",
-})  # fmt: skip
+_VIDEO = re.compile(r"\.(3gp|avi|insv|m2ts|m4v|mkv|mov|mp4|mpeg|mpg|mts|webm|wmv)")
 """Endings by which videos in a folder are recognised; a video named itself may have any."""
 _TABLES = frozenset({"rgb.txt", "traj.txt"})
 """Files of a data set, which is one source whatever else it contains."""
@@ -82,9 +79,9 @@ def _lines(place: StoragePath, folder: Path | None) -> Iterator[str]:
 def _inside(place: StoragePath) -> list[str]:
     """Sources in a folder; empty if it is a source itself."""
     listed = {name: kind for name, kind in place.listed().items() if not name.startswith(".")}
-    videos = [n for n, is_folder in listed.items() if not is_folder and _suffix(n) in VIDEOS]
     folders = [name for name, is_folder in listed.items() if is_folder]
     plain = [name for name, is_folder in listed.items() if not is_folder]
+    videos = [name for name in plain if _VIDEO.fullmatch(_suffix(name))]
     is_data_set = not _TABLES.isdisjoint(plain)
     if is_data_set or (not videos and (plain or not folders)):
         return []
@@ -94,7 +91,7 @@ def _inside(place: StoragePath) -> list[str]:
 def _stem(address: str) -> str:
     """A plain name for a folder, from the last part of an address."""
     name = StoragePath(address.rstrip("/")).name
-    stem = name[: -len(_suffix(name))] if _suffix(name) in VIDEOS else name
+    stem = name[: -len(_suffix(name))] if _VIDEO.fullmatch(_suffix(name)) else name
     return re.sub(r"[^\w.-]+", "_", stem).strip("._-") or "source"
 
 

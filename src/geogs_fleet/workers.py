@@ -40,7 +40,10 @@ class RayWorkers:
         say: Callable[[str], None] = lambda sentence: None,
     ) -> None:
         """``allocation``: resources of each job; ``say`` receives a line for every stage."""
-        self._ray, self._allocation, self._attempts, self._say = ray, allocation, attempts, say
+        self._ray = ray
+        self._allocation = allocation
+        self._attempts = attempts
+        self._say = say
 
     @property
     def at_once(self) -> int:
@@ -53,7 +56,8 @@ class RayWorkers:
         Raises:
             GeogsError: as ``function`` raises it, or a job failed as often as it was tried.
         """
-        begin, ray = time.monotonic(), self._ray
+        begin = time.monotonic()
+        ray = self._ray
         task = as_task(ray, function, self._allocation, retries=self._attempts - 1)
         references = [task(*job) for job in jobs]
         try:

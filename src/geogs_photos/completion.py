@@ -12,7 +12,7 @@ from geogs.application.structure_from_motion.completion import about
 from geogs.io.sources.calibration import Calibration
 from geogs.stopwatch import StageProgress
 from geogs.types import FoundFrames, Frame
-from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
+from geogs_photos.database import Entry, SharedCamera, write_database
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import believed, parts_of_one_scale
 from geogs_photos.incremental_mapping import continued, placed_images, world_to_camera
@@ -38,8 +38,8 @@ def place_lost(
     pairs = frame_pairs([e.features for e in entries], seed, progress)
     with tempfile.TemporaryDirectory(prefix="geogs-lost-") as work:
         database = Path(work) / "database.db"
-        write_database(database, [SharedCamera(seen_by, is_known=True)], entries)
-        match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
+        cameras = [SharedCamera(seen_by, is_known=True)]
+        write_database(database, cameras, entries, pairs, seed, lambda f: progress("matching", f))
         model = continued(database, Path(work), known, seed, lambda f: progress("finding poses", f))
         if model is None:
             return FoundFrames.none()

@@ -8,18 +8,20 @@ one can be true. If the sides of a building look alike, false matches can outnum
 """
 
 from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from geogs.evaluation.rotation_errors import rotation_angle
 from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs_photos.incremental_mapping import without_poses
+from geogs.tracking.matching.two_view_rotation import gric
+from geogs_photos.incremental_mapping import placed_images, without_poses
 from geogs_photos.photo_pairs import FOLLOWING
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
@@ -35,6 +37,15 @@ _FOLLOWING_WEIGHT_IN_CUTS = 1000
 """The same weight in the search for a cut: the cut prefers to go through other pairs, however many,
 rather than around single frames with few matches."""
 _ROUNDS = 15
+PAIRS = 60
+"""Largest number of pairs of pictures that are tested for a pure rotation; evenly spread ones of
+more."""
+NEARLY_ALL = 0.9
+"""Least fraction of them that a rotation has to explain as well as the poses do."""
+DEVIATION = 0.5
+"""Least standard deviation of matches, pixels."""
+_FOCAL_RANGE = 0.3
+"""Range of the search for the logarithm of the focal length's correction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +139,13 @@ def undivided(count: int, votes: Sequence[Vote]) -> list[list[int]]:
     A contradicting pair of ``votes`` is separated by the minimum cut of the supporting votes (Ford
     and Fulkerson 1956), if more votes across that cut contradict than support the poses.
     """
-    parts, open_parts = list[list[int]](), [list(range(count))]
+    parts = list[list[int]]()
+    open_parts = [list(range(count))]
     while open_parts:
         part = open_parts.pop()
         own = {k: place for place, k in enumerate(part)}
         inside = [
-            Vote(own[v.one], own[v.other], v.matches, v.is_following)
+            replace(v, one=own[v.one], other=own[v.other])
             for v in votes
             if v.one in own and v.other in own
         ]
@@ -172,3 +184,41 @@ def _graph(count: int, joins: Iterable[Vote]) -> csr_array:
     ]
     one, other, weight = np.array(rows, np.int32).reshape(-1, 3).T
     return csr_array(coo_array((weight, (one, other)), shape=(count, count)))
+
+
+def only_rotates(model: Any, database: Path) -> bool:
+    """Whether a rotation alone explains the matches of nearly all pairs of pictures.
+
+    With a slightly wrong focal length, a rotation looks like parallax, and points at arbitrary
+    distances explain it to a tenth of a pixel. A rotation with another focal length explains it as
+    well, with fewer parameters; no focal length does so for a camera that moved, however little.
+
+    All pairs have one focal length, with which rotations leave the smallest residuals. Torr's
+    criterion (:func:`gric`) selects the model of each pair.
+    """
+    images = [image.image_id for image in placed_images(model)]
+    pairs = list(verified_matches(model, database, images))
+    pairs = pairs[:: -(-len(pairs) // PAIRS) or 1]
+    if not pairs:
+        return False
+    deviation = max(DEVIATION, float(model.compute_mean_reprojection_error()))
+    found = minimize_scalar(
+        lambda longer: np.concatenate([_off(p, longer).clip(max=MAX_ERROR) for p in pairs]).mean(),
+        bounds=(-_FOCAL_RANGE, _FOCAL_RANGE),
+        method="bounded",
+        options={"xatol": 0.01},
+    )
+    explained = [
+        gric((_off(p, found.x) / deviation) ** 2, 2, 3)
+        <= gric((p.epipolar() / deviation) ** 2, 3, 5)
+        for p in pairs
+    ]
+    return float(np.mean(explained)) >= NEARLY_ALL
+
+
+def _off(pair: PairMatches, longer: float) -> Float64[np.ndarray, "n"]:
+    """Residuals of matches after the best rotation, pixels, if the logarithm of the focal length is
+    larger by ``longer``."""
+    times = float(np.exp(longer))
+    one, two = (rays / [times, times, 1.0] for rays in pair.rays)
+    return times * pair.focal * best_rotation(one, two)[1]

@@ -46,8 +46,19 @@ class Entry:
     features: PhotoFeatures
 
 
-def write_database(path: Path, cameras: Sequence[SharedCamera], entries: Sequence[Entry]) -> None:
-    """Write cameras, pictures and features; cameras and pictures are numbered from 1."""
+def write_database(
+    path: Path,
+    cameras: Sequence[SharedCamera],
+    entries: Sequence[Entry],
+    pairs: Pairs,
+    seed: int,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> np.ndarray:
+    """Write cameras, pictures, features, and the matches that one motion of the camera explains.
+
+    Cameras and pictures are numbered from 1. Returns the number of kept matches between any two
+    pictures, a symmetric matrix.
+    """
     colmap = load_colmap()
     with closing(colmap.Database.open(path)) as database:
         for place, camera in enumerate(cameras):
@@ -61,20 +72,6 @@ def write_database(path: Path, cameras: Sequence[SharedCamera], entries: Sequenc
             kind = colmap.FeatureExtractorType.SIFT
             descriptors = colmap.FeatureDescriptors(type=kind, data=features.descriptors)
             database.write_descriptors(place + 1, descriptors)
-
-
-def match_pairs(
-    path: Path,
-    entries: Sequence[Entry],
-    pairs: Pairs,
-    seed: int,
-    progress: Callable[[float], None],
-) -> np.ndarray:
-    """Match pairs of pictures and keep the matches that one motion of the camera explains.
-
-    Returns the number of kept matches between any two pictures, a symmetric matrix.
-    """
-    colmap = load_colmap()
     matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=worker_count())
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
@@ -92,10 +89,7 @@ def match_pairs(
         )
         progress(min(1.0, (begin + ROUND) / len(pairs)))
     listed.unlink(missing_ok=True)
-    return _kept_matches(colmap, path, len(entries))
-
-
-def _kept_matches(colmap: Any, path: Path, count: int) -> np.ndarray:
+    count = len(entries)
     with closing(colmap.Database.open(path)) as database:
         numbers, matches = database.read_two_view_geometry_num_inliers()
     kept = np.zeros((count, count), np.int64)
@@ -115,14 +109,18 @@ def _camera(colmap: Any, number: int, shared: SharedCamera) -> Any:
         )
         camera.has_prior_focal_length = not c.is_guess
         return camera
-    models, terms = colmap.CameraModelId, [*c.distortion, *[0.0] * 8]
+    models = colmap.CameraModelId
+    terms = [*c.distortion, *[0.0] * 8]
     camera = colmap.Camera(camera_id=number, width=c.width, height=c.height)
     if c.lens == "fisheye":
-        camera.model, count = models.OPENCV_FISHEYE, 4
+        camera.model = models.OPENCV_FISHEYE
+        count = 4
     elif any(terms[4:8]):
-        camera.model, count = models.FULL_OPENCV, 8
+        camera.model = models.FULL_OPENCV
+        count = 8
     else:
-        camera.model, count = models.OPENCV, 4
+        camera.model = models.OPENCV
+        count = 4
     camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *terms[:count]]
     camera.has_prior_focal_length = True
     return camera

@@ -75,12 +75,15 @@ def without_gauge(
     """
     count = len(T_cw)
     beside = [range(count)] * count if beside is None else beside
-    back, t, eye = T_cw[:, :3, :3].transpose(0, 2, 1), T_cw[:, :3, 3], np.eye(3)
+    back = T_cw[:, :3, :3].transpose(0, 2, 1)
+    t = T_cw[:, :3, 3]
+    eye = np.eye(3)
     moves = block_diag(*np.concatenate([back @ np.cross(t[:, None], eye), -back], 2))
     rotations = block_diag(*np.concatenate([back, 0 * back], 2))
     centres = -np.einsum("nij,nj->ni", back, t)
     centres = centres - centres.mean(0)
-    identity, rotated = np.tile(eye, (count, 1)), np.cross(centres[:, None], eye).reshape(-1, 3)
+    identity = np.tile(eye, (count, 1))
+    rotated = np.cross(centres[:, None], eye).reshape(-1, 3)
     similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
     return _left(moves, joint, similarity, beside), _left(rotations, joint, identity, beside)
 
@@ -92,7 +95,8 @@ def _left(
     beside: Sequence[Sequence[int]],
 ) -> Float64[np.ndarray, "n"]:
     """Standard deviation of each triple of J x after a fit of ``gauge`` to the triples beside."""
-    covariance, left = J @ joint @ J.T, np.zeros(len(beside))
+    covariance = J @ joint @ J.T
+    left = np.zeros(len(beside))
     for k, fitted in enumerate(beside):
         own = slice(3 * k, 3 * k + 3)
         rows = np.add.outer(3 * np.array(fitted, int), range(3)).reshape(-1)
@@ -107,7 +111,8 @@ def _evidence(model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 
     """Copy the reconstruction with these pictures alone, without points nearer than ``NEAREST``."""
     model = load_colmap().Reconstruction(model)
     own = [image.image_id for image in images]
-    model, near = without_poses(model, {*model.reg_image_ids()} - {*own}), set[int]()
+    model = without_poses(model, {*model.reg_image_ids()} - {*own})
+    near = set[int]()
     for number, T in zip(own, T_cw, strict=True):
         seen = [p.point3D_id for p in model.images[number].points2D if p.has_point3D()]
         xyz = np.array([model.points3D[point].xyz for point in seen]).reshape(-1, 3)

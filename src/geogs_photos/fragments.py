@@ -16,6 +16,7 @@ near their previous positions.
 import shutil
 from collections.abc import Callable, Container, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,12 @@ from jaxtyping import Bool, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from geogs.application.results.verdict import MAX_POSITION_DEVIATION
 from geogs.evaluation.trajectory_errors import extent_of
 from geogs.threads import worker_count
 from geogs_photos.contradictions import false_pairs, undisputed
 from geogs_photos.database import SharedCamera, known_cameras
+from geogs_photos.deviations import pose_deviations
 from geogs_photos.incremental_mapping import (
     CLOSE,
     LEAST_IMAGES,
@@ -40,7 +43,6 @@ from geogs_photos.incremental_mapping import (
     without_poses,
     world_to_camera,
 )
-from geogs_photos.known_positions import with_known_positions
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_VIEWS = 3
@@ -51,6 +53,9 @@ frames that the one from close matches has to contain at the same positions."""
 SAME_PLACE = 0.15
 """Largest shift of a frame, as a fraction of the path's extent. Moving objects shift frames by a
 tenth; a wrong world has arbitrary shifts."""
+OUTLIER_RATIO = 3.0
+"""Least ratio of an outlier's standard deviation to the median: if all are uncertain, that is left
+to the verdict."""
 
 
 def rejoined(
@@ -71,15 +76,13 @@ def rejoined(
         seed: of the random choices.
         progress: called with a stage and its finished fraction; its exceptions end the work.
     """
+    once_more = partial(progress, "finding poses again")
     known = known_cameras(cameras)
     is_known = len(known) == len(cameras)
     false = false_pairs(parts[0], database) if parts else []
     best = _believed(parts, database, is_known)
     if false and _placed(best) < WHOLE * count:
-        again, database = _without(
-            false, database, count, known, seed,
-            lambda f: progress("finding poses again", f),
-        )  # fmt: skip
+        again, database = _without(false, database, count, known, seed, once_more)
         best = max(best, _believed(again, database, is_known), key=_placed)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
@@ -87,13 +90,11 @@ def rejoined(
         best = max(best, _believed(once, database, is_known), key=_placed)
         progress("finding poses globally", 1.0)
     if best and _placed(best) < WHOLE * count and not is_known:
-        again = _with_camera_of(
-            best[0], database, count, seed, lambda f: progress("finding poses again", f)
-        )
+        again = _with_camera_of(best[0], database, count, seed, once_more)
         best = max(best, _believed(again, database, is_known), key=_placed)
     if best:
         first = refine(load_colmap().Reconstruction(best[0]), cameras)
-        again = _closely(first, database, count, seed, lambda f: progress("finding poses again", f))
+        again = _closely(first, database, count, seed, once_more)
         closer = _believed(again, database, is_known)
         if closer and same_places(first, closer[0]):
             best = closer
@@ -105,7 +106,8 @@ def same_places(one: Any, other: Any) -> bool:
 
     Shifts up to ``SAME_PLACE`` of their extent, after the best similarity, count as the same.
     """
-    images, there = placed_images(one), {image.image_id for image in placed_images(other)}
+    images = placed_images(one)
+    there = {image.image_id for image in placed_images(other)}
     both = [image for image in images if image.image_id in there]
     if len(both) < max(WHOLE * len(images), LEAST_IMAGES):
         return False
@@ -139,7 +141,9 @@ def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
 
 def parts_of_one_scale(model: Any, numbers: Sequence[int]) -> list[list[int]]:
     """Indices in ``numbers`` of the pictures of one scale, part by part, the largest first."""
-    seen, left, parts = _firm_points(model, numbers), np.arange(len(numbers)), list[list[int]]()
+    seen = _firm_points(model, numbers)
+    left = np.arange(len(numbers))
+    parts = list[list[int]]()
     while len(left):
         kept = left[of_one_scale(seen[:, left], np.zeros(len(left), bool))]
         left = np.setdiff1d(left, kept)
@@ -187,7 +191,7 @@ def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndar
 def _believed(parts: Sequence[Any], database: Path, is_known: bool) -> list[Any]:
     """The accepted part of each reconstruction; the largest first."""
     found = (with_known_positions(believed(part, database), is_known) for part in parts)
-    return sorted(found, key=lambda part: -_placed([part]))
+    return sorted(found, key=lambda part: -len(placed_images(part)))
 
 
 def _placed(parts: Sequence[Any]) -> int:
@@ -216,24 +220,22 @@ def _globally(database: Path, is_known: bool, seed: int) -> list[Any]:
     colmap = load_colmap()
     options = colmap.GlobalPipelineOptions(num_threads=worker_count(), random_seed=seed)
     mapper = options.mapper
-    mapper.random_seed, mapper.num_threads = seed, worker_count()
+    mapper.random_seed = seed
+    mapper.num_threads = worker_count()
     for stage in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
         stage.random_seed = seed
     adjustment = mapper.bundle_adjustment
     mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
     adjustment.refine_focal_length = adjustment.refine_extra_params = not is_known
-    own, work = database.with_name("global.db"), database.with_name("global")
+    own = database.with_name("global.db")
+    work = database.with_name("global")
     shutil.copy(database, own)
     work.mkdir()
     return largest_first(colmap.global_mapping(own, work, work, options))
 
 
 def _with_camera_of(
-    model: Any,
-    database: Path,
-    count: int,
-    seed: int,
-    progress: Callable[[float], None],
+    model: Any, database: Path, count: int, seed: int, progress: Callable[[float], None]
 ) -> list[Any]:
     colmap = load_colmap()
     own = _with_cameras(model, database, "again.db")
@@ -247,15 +249,12 @@ def _with_camera_of(
 
 
 def _closely(
-    model: Any,
-    database: Path,
-    count: int,
-    seed: int,
-    progress: Callable[[float], None],
+    model: Any, database: Path, count: int, seed: int, progress: Callable[[float], None]
 ) -> list[Any]:
     model.update_point_3d_errors()
     within = CLOSE * model.compute_mean_reprojection_error()
-    own, known = _with_cameras(model, database, "closely.db"), list(model.cameras)
+    own = _with_cameras(model, database, "closely.db")
+    known = list(model.cameras)
     return put_together(own, own.with_name("closely"), count, known, seed, progress, within)
 
 
@@ -268,3 +267,26 @@ def _with_cameras(model: Any, database: Path, name: str) -> Path:
             camera.has_prior_focal_length = True
             opened.update_camera(camera)
     return own
+
+
+def with_known_positions(model: Any, is_known: bool) -> Any:
+    """Keep the frames whose positions the matches determine; the others lose their poses.
+
+    A frame that sees little but far points, or the rest of the world in one direction only, can be
+    anywhere on a line according to its matches, and thereby enlarges the extent of the path that is
+    the measure of its uncertainty. So the worst are removed first, until all have standard
+    deviations of at most ``MAX_POSITION_DEVIATION`` of it.
+
+    Args:
+        model: by incremental or global mapping.
+        is_known: whether the camera was given, or estimated along with the poses.
+    """
+    while len(images := placed_images(model)) > LEAST_IMAGES:
+        T_cw = np.stack([world_to_camera(image) for image in images])
+        deviation, _ = pose_deviations(model, images, T_cw, is_known)
+        allowed = MAX_POSITION_DEVIATION * extent_of(np.linalg.inv(T_cw))
+        unknown = deviation > max(allowed, OUTLIER_RATIO * float(np.median(deviation)))
+        if not unknown.any():
+            break
+        model = without_poses(model, [images[k].image_id for k in np.flatnonzero(unknown)])
+    return model

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from geogs.geometry.umeyama import umeyama
 from geogs.threads import worker_count
-from geogs_photos.database import SharedCamera
+from geogs_photos.database import SharedCamera, known_cameras
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_IMAGES = 3
@@ -34,7 +34,6 @@ LEAST_WITHIN = 0.3
 """Least such limit, pixels: features are hardly more accurate."""
 POSE_FACTOR = 3.0
 """Multiple of the limit for matches that give a picture its pose before the adjustment."""
-_ITERATIONS, _TOLERANCE = 50, 1e-6
 
 
 def put_together(
@@ -90,7 +89,8 @@ def continued(
     colmap = load_colmap()
     options = _options([1], seed, multiple_models=False, fix_existing_frames=True)
     options.mapper.abs_pose_min_num_inliers = LEAST_POINTS
-    begun, went_on = work / "begun", work / "on"
+    begun = work / "begun"
+    went_on = work / "on"
     model, count = of_poses(database, known)
     for folder in (begun, went_on):
         folder.mkdir(parents=True, exist_ok=True)
@@ -103,9 +103,13 @@ def continued(
             _keep_within(options, within, model.cameras.values())
     model.write(begun)
     models = colmap.incremental_mapping(
-        database, work, went_on, options=options, input_path=begun,
+        database,
+        work,
+        went_on,
+        options=options,
+        input_path=begun,
         next_image_callback=_counting(len(known), count, progress),
-    )  # fmt: skip
+    )
     return next(iter(largest_first(models)), None)
 
 
@@ -200,7 +204,7 @@ def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:
     hardly distinguish, did not improve surveyed cameras.
     """
     colmap = load_colmap()
-    known = {place + 1 for place, camera in enumerate(cameras) if camera.is_known}
+    known = set(known_cameras(cameras))
     free = {number for number in model.cameras if _is_free(model, number) and number not in known}
     trial = colmap.Reconstruction(model)
     for number in free:
@@ -210,17 +214,11 @@ def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:
             camera.model = colmap.CameraModelId.RADIAL
             camera.params = [focal, cx, cy, k1, 0.0]
     if free:
-        _adjust(colmap, trial, set(model.cameras) - free, with_centres=True)
+        adjust(trial, set(model.cameras) - free)
         if all(_is_central(trial.cameras[number]) for number in free):
             return trial
-    _adjust(colmap, model, known, with_centres=False)
+    adjust(model, known, with_centres=False)
     return model
-
-
-def adjust_free(model: Any, known: Container[int]) -> None:
-    """Adjust a refined reconstruction again, with all parameters of the unknown cameras."""
-    colmap, constant = load_colmap(), {number for number in model.cameras if number in known}
-    _adjust(colmap, model, constant, with_centres=True)
 
 
 def _is_free(model: Any, number: int) -> bool:
@@ -240,13 +238,19 @@ def _is_central(camera: Any) -> bool:
     return offset <= MAX_OFFSET * max(camera.width, camera.height)
 
 
-def _adjust(colmap: Any, model: Any, constant: set[int], with_centres: bool) -> None:
+def adjust(model: Any, constant: Collection[int], with_centres: bool = True) -> None:
+    """Adjust a reconstruction in place, robustly.
+
+    All parameters of the cameras are free, except for those of the ``constant`` ones and, unless
+    ``with_centres``, the principal points.
+    """
+    colmap = load_colmap()
     options = colmap.BundleAdjustmentOptions(
         refine_principal_point=with_centres, print_summary=False
     )
     options.ceres.loss_function_type = colmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.max_num_iterations = _ITERATIONS
-    options.ceres.solver_options.function_tolerance = _TOLERANCE
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-6
     options.ceres.solver_options.num_threads = worker_count()
     config = colmap.BundleAdjustmentConfig()
     for number in model.reg_image_ids():

@@ -10,13 +10,12 @@ from geogs.geometry.camera import Camera
 from geogs.types import Frame
 from geogs_photos.photo_features import find_features, squared_distances
 from geogs_photos.pycolmap_library import load_colmap
+from geogs_photos.verified_matches import MAX_ERROR
 
 NEIGHBOURS = 2
 """Number of frames with a pose, before and after a frame, whose points it is matched with."""
 LEAST_INLIERS = 20
 """Fewest inliers of an accepted pose."""
-MAX_ERROR = 4.0
-"""Largest reprojection error of an inlier, pixels."""
 _RATIO = 0.8
 
 
@@ -25,13 +24,16 @@ class Localiser:
 
     def __init__(self, video: PlacedVideo, camera: Camera, seed: int) -> None:
         """``camera`` is that of the frames to localise."""
-        self._positions, self._descriptors = video.positions, video.descriptors
+        self._positions = video.positions
+        self._descriptors = video.descriptors
         self._places = np.array(video.numbers)
         colmap = load_colmap()
         self._camera: Any = colmap.Camera(
-            model=colmap.CameraModelId.PINHOLE, width=camera.width, height=camera.height,
+            model=colmap.CameraModelId.PINHOLE,
+            width=camera.width,
+            height=camera.height,
             params=[camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5],
-        )  # fmt: skip
+        )
         self._options = colmap.AbsolutePoseEstimationOptions()
         self._options.ransac.max_error = MAX_ERROR
         self._options.ransac.random_seed = seed

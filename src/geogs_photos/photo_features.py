@@ -37,6 +37,12 @@ class PhotoFeatures:
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    def stretched(self, factor: float) -> "PhotoFeatures":
+        """The features of a picture stretched to the right by a factor."""
+        keypoints = self.keypoints.copy()
+        keypoints[:, 0] = (keypoints[:, 0] + 0.5) * factor - 0.5
+        return PhotoFeatures(keypoints, self.descriptors)
+
     def largest(self, count: int) -> UInt8[np.ndarray, "m 128"]:
         """Descriptors of the features with the largest scale."""
         order = np.argsort(-self.keypoints[:, 2], kind="stable")

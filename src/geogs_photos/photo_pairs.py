@@ -32,7 +32,8 @@ NEIGHBOURS = 2
 """Number of next pictures by name that are always matched: photographs are often consecutive."""
 FOLLOWING = 6
 """Number of next frames of a video with which each is always matched."""
-_WORDS, _SAMPLE, _CANDIDATES = 64, 200, 60
+_CANDIDATES = 60
+"""Most similar pictures of each that are previewed."""
 _RATIO = 0.85
 
 Pairs = list[tuple[int, int]]
@@ -68,7 +69,8 @@ def mutual_matches(one: Float32[np.ndarray, "n 128"], other: Float32[np.ndarray,
     if len(one) < 2 or len(other) < 2:
         return 0
     distance = squared_distances(one, other)
-    forward, backward = distance.argmin(1), distance.argmin(0)
+    forward = distance.argmin(1)
+    backward = distance.argmin(0)
     two = np.partition(distance, 1, axis=1)[:, :2].clip(0)
     is_clear = two[:, 0] < _RATIO**2 * two[:, 1]
     return int((is_clear & (backward[forward] == np.arange(len(one)))).sum())
@@ -110,8 +112,8 @@ def vlad(
     The words are the means of clusters of the pictures' own descriptors. A picture without
     descriptors gets zeros.
     """
-    sample = np.concatenate([d[:_SAMPLE] for d in descriptors]).astype(np.float32)
-    words = _clusters(sample, min(_WORDS, len(sample)), seed)
+    sample = np.concatenate([d[:200] for d in descriptors]).astype(np.float32)
+    words = _clusters(sample, min(64, len(sample)), seed)
     vectors = np.zeros((len(descriptors), words.size), np.float32)
     for vector, some in zip(vectors, descriptors, strict=True):
         if not len(some):

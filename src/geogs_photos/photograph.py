@@ -1,17 +1,16 @@
 """Photographs in a folder, with their sizes and cameras."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from geogs.errors import InputError
-from geogs.io.pictures import header_read
-from geogs.io.sources.formats.image_files import SUFFIXES, image_folder, natural_key
+from PIL.ExifTags import IFD, Base
 
-_MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
-_QUARTER_TURNS = {6: 1, 7: 1, 3: 2, 4: 2, 8: 3, 5: 3}
-"""Number of clockwise quarter turns to the upright picture, by EXIF orientation."""
+from geogs.errors import InputError
+from geogs.io.pictures import header_read, size_and_turns
+from geogs.io.sources.account import Account
+from geogs.io.sources.formats.chosen_pictures import images_among, unread
+from geogs.io.sources.formats.image_files import SUFFIXES, image_folder, natural_key, without_images
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +46,8 @@ class PhotoFolder:
     """In natural order of their names."""
     damaged: tuple[str, ...]
     """Names of picture files that cannot be read."""
+    account: Account = field(default_factory=Account)
+    """Pictures of kinds that are not read, or that are depth or masks."""
 
 
 def find_photographs(folder: str | Path) -> PhotoFolder:
@@ -59,23 +60,24 @@ def find_photographs(folder: str | Path) -> PhotoFolder:
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; --poses auto needs a folder of photographs.")
     root = image_folder(folder)
-    paths = _pictures(root.iterdir() if root else folder.rglob("*"))
+    files = [path for path in (root.iterdir() if root else folder.rglob("*")) if path.is_file()]
     root = root or folder
+    paths, others = images_among(_pictures(files))
+    others += unread((path.name for path in files), paths)
     found = [(path, _photograph(path, root)) for path in paths]
     good = tuple(photograph for _, photograph in found if photograph is not None)
     damaged = tuple(_name(path, root) for path, photograph in found if photograph is None)
     if not good:
         raise InputError(
-            f"{folder} holds no photographs that can be read ({', '.join(sorted(SUFFIXES))})."
+            without_images(folder)
+            or f"{folder} holds no photographs that can be read ({', '.join(sorted(SUFFIXES))})."
         )
-    return PhotoFolder(root, good, damaged)
+    return PhotoFolder(root, good, damaged, Account(left=tuple(others)))
 
 
 def _pictures(paths: Iterable[Path]) -> list[Path]:
     kept = [
-        path
-        for path in paths
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+        path for path in paths if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
     ]
     return sorted(kept, key=lambda path: (natural_key(str(path)), str(path)))
 
@@ -88,18 +90,13 @@ def _photograph(path: Path, root: Path) -> Photograph | None:
     """Read the header of a picture; none if it is damaged."""
     try:
         with header_read(path) as picture:
-            width, height = picture.size
+            (width, height), turns = size_and_turns(picture)
             base = picture.getexif()
-            exif = base.get_ifd(_EXIF_IFD)
-            own = [base.get(_MAKE), base.get(_MODEL)]
-            own += [exif.get(tag) for tag in (_LENS_MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM)]
+            exif = base.get_ifd(IFD.Exif)
+            own = [base.get(Base.Make), base.get(Base.Model)]
+            tags = (Base.LensModel, Base.FocalLength, Base.FocalLengthIn35mmFilm)
+            own += [exif.get(tag) for tag in tags]
             words = tuple("" if w is None else str(w).strip("\0 ") for w in own)
-            turns = _turns(base)
     except Exception:  # any error of the many readers on a damaged file
         return None
     return Photograph(path, _name(path, root), Lens(width, height, words), turns)
-
-
-def _turns(exif: Mapping[int, object]) -> int:
-    orientation = exif.get(_ORIENTATION)
-    return _QUARTER_TURNS.get(orientation, 0) if isinstance(orientation, int) else 0

@@ -13,15 +13,10 @@ from geogs.io.pictures import read_mask
 from geogs.io.sources.formats.colmap import mask_beside
 from geogs.io.sources.known_intrinsics import calibration_from_exif, resolve_intrinsics
 from geogs.io.sources.posed.stored_pictures import read_picture
+from geogs.io.sources.tones import Tones, tones_of_files
 from geogs.stopwatch import StageProgress
 from geogs.threads import thread_map, worker_count
-from geogs_photos.database import (
-    Entry,
-    SharedCamera,
-    known_cameras,
-    match_pairs,
-    write_database,
-)
+from geogs_photos.database import Entry, SharedCamera, known_cameras, write_database
 from geogs_photos.incremental_mapping import put_together, refine
 from geogs_photos.photo_features import MAX_FEATURES, PhotoFeatures, find_features
 from geogs_photos.photo_pairs import Pairs, choose_pairs
@@ -77,10 +72,12 @@ def find_poses(
             "poses needs three or more."
         )
     cameras, camera_of = shared_cameras(photographs, intrinsics)
+    tones = tones_of_files([photograph.path for photograph in photographs])
     features = thread_map(
-        lambda p: _features(p, folder.root, most_features), photographs,
+        lambda p: _features(p, folder.root, most_features, tones),
+        photographs,
         lambda f: progress("features", f),
-    )  # fmt: skip
+    )
     pairs = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
     names = [photograph.name for photograph in photographs]
     entries = [Entry(*e) for e in zip(names, camera_of, features, strict=True)]
@@ -112,12 +109,17 @@ def structure_of(
     progress: StageProgress,
 ) -> tuple[list[Any], np.ndarray]:
     """Connected parts, largest first, and the number of kept matches of any two pictures."""
-    write_database(database, cameras, entries)
-    kept = match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
+    kept = write_database(
+        database, cameras, entries, pairs, seed, lambda f: progress("matching", f)
+    )
     parts = put_together(
-        database, database.with_name("models"), len(entries), known_cameras(cameras), seed,
+        database,
+        database.with_name("models"),
+        len(entries),
+        known_cameras(cameras),
+        seed,
         lambda f: progress("finding poses", f),
-    )  # fmt: skip
+    )
     return parts, kept
 
 
@@ -162,10 +164,10 @@ def reasons(
     return left_out
 
 
-def _features(photograph: Photograph, root: Path, most: int) -> PhotoFeatures:
+def _features(photograph: Photograph, root: Path, most: int, tones: Tones) -> PhotoFeatures:
     """Features of a photograph, inside its mask if there is one; none if it is damaged."""
     try:
-        picture = read_picture(photograph.path)
+        picture = read_picture(photograph.path, tones=tones)
     except InputError:
         return PhotoFeatures.none()
     mask = mask_beside(root, photograph.name)

@@ -13,7 +13,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
-from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
+from geogs_photos.database import Entry, SharedCamera, write_database
 from geogs_photos.incremental_mapping import of_poses
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
@@ -73,8 +73,7 @@ def find_start_points(views: Sequence[PosedView], seed: int = 0) -> StartPoints:
     ]
     with tempfile.TemporaryDirectory(prefix="geogs-points-") as folder:
         database = Path(folder) / "database.db"
-        write_database(database, shared, entries)
-        match_pairs(database, entries, pairs, seed, lambda fraction: None)
+        write_database(database, shared, entries, pairs, seed)
         model = _triangulated(database, views, seed)
     positions = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     inside = in_visual_hull(views, positions)
@@ -120,7 +119,8 @@ def _triangulated(database: Path, views: Sequence[PosedView], seed: int) -> Any:
 def _colours(views: Sequence[PosedView], model: Any) -> UInt8[np.ndarray, "n 3"]:
     """Mean colour of the pixels that see each point."""
     row = {number: k for k, number in enumerate(model.points3D)}
-    total, count = np.zeros((len(row), 3)), np.zeros((len(row), 1))
+    total = np.zeros((len(row), 3))
+    count = np.zeros((len(row), 1))
     for image in model.images.values():
         view = views[image.image_id - 1]
         for seen in (p for p in image.points2D if p.has_point3D()):

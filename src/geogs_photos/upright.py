@@ -34,7 +34,8 @@ def upright_rotation(
         quarter_turns: clockwise, from each picture as it is stored to the upright one.
     """
     turned = np.stack([_turn(k) @ R for k, R in zip(quarter_turns, R_cw, strict=True)])
-    x_axes, y_axes = turned[:, 0], turned[:, 1]
+    x_axes = turned[:, 0]
+    y_axes = turned[:, 1]
     values, vectors = np.linalg.eigh(x_axes.T @ x_axes / len(x_axes))
     mean_down = y_axes.mean(0)
     down = vectors[:, 0] if values[1] > LEAST_SPREAD else mean_down

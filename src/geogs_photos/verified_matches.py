@@ -59,10 +59,12 @@ def verified_matches(
                 continue
             first, second = (world_to_camera(model.images[n]) for n in (one, other))
             yield PairMatches(
-                one, other, second @ np.linalg.inv(first),
+                one,
+                other,
+                second @ np.linalg.inv(first),
                 (a[is_seen], b[is_seen]),
                 float(model.cameras[model.images[one].camera_id].mean_focal_length()),
-            )  # fmt: skip
+            )
 
 
 def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:

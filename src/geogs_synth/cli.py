@@ -9,48 +9,47 @@ from geogs.cli.options import Given, parse_options
 from geogs.config import Seed
 from geogs.config.setting import Positional, Range, Settings
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
-from geogs_synth.motion.motion_kinds import MotionKind
-from geogs_synth.scene.lamp_kinds import LampKind
+from geogs_synth.motion.motion_kinds import LampKind, MotionKind
 
 
 @dataclass(frozen=True)
 class SynthOptions(Settings):
-    """Renders a scene, drawn at random, as a moving camera sees it, with exact truth.
+    """Renders a random scene from a moving camera, and writes the exact truth with it.
 
-    A furnished room and a perfect camera, if nothing else is said; ``--motion driving`` goes
-    through a street, ``--motion dining`` around a table among thin things. Flaws of the camera:
-    those of ``--camera``, and single ones beside it, ``--flaws.readout 0.03``.
+    By default a perfect camera moves through a furnished room; ``--motion driving`` shows a street,
+    ``--motion dining`` a table among thin things. ``--camera`` gives the camera typical flaws;
+    options such as ``--flaws.readout 0.03`` set single ones.
     """
 
     output: Annotated[Path, Positional()]
     """Folder to write, in the layout of Replica."""
     frames: Annotated[int, Range(1, 100_000)] = 120
-    """Number of frames; after 280 the camera is back at its start."""
+    """Number of frames; the hand-held camera is back at its start after 280."""
     width: Annotated[int, Range(16, 8192)] | None = None
-    """Pixels; none is 320, on the street 1241."""
+    """Width of the images, pixels; none takes 320, on the street 1241."""
     height: Annotated[int, Range(16, 8192)] | None = None
-    """Pixels; none is 240, on the street 376."""
+    """Height of the images, pixels; none takes 240, on the street 376."""
     seed: Seed = 0
-    """Another seed gives another room and another path."""
+    """Seed of the scene, the path and the noise."""
     motion: MotionKind = "handheld"
-    """How the camera is moved."""
+    """Motion of the camera, and the place that it moves through."""
     camera: CameraKind = "clean"
-    """A camera with typical flaws, or none."""
+    """Kind of camera; all but ``clean`` have typical flaws."""
     flaws: Flaws = field(default_factory=Flaws)
-    """Single flaws, over those of the camera."""
+    """Single flaws, which replace those of the camera."""
     moving: Annotated[float, Range(0, 0.5)] = 0.0
-    """Fraction of the image that people cover who cross the view; 0 lets nothing move."""
+    """Fraction of the image that moving people (on the street vehicles) cover; 0 has none."""
     lamps: LampKind = "steady"
-    """Switched: each third of the sequence shows the room in another light."""
+    """Behaviour of the lamps: ``switched`` lights each third of the sequence in another way."""
     depth: bool = True
-    """Write depth images too."""
+    """Whether depth images are written."""
     depth_sensor: bool = False
-    """Write depth as a sensor measures it: with noise that grows with its square, holes, and
-    nothing beyond 5 m; else it is exact."""
+    """Whether depth has the noise, the holes and the range (5 m) of a depth sensor; otherwise it is
+    exact."""
     image_format: Literal["jpg", "png"] = "jpg"
-    """JPEG of quality 95, or lossless."""
+    """Format of the images: JPEG of quality 95, or PNG without loss."""
     video: bool = False
-    """Write video.mp4 too."""
+    """Whether video.mp4 is written as well."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -60,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from geogs_synth.camera.depth_sensor import DepthSensor
+    from geogs_synth.camera.sensors import DepthSensor
     from geogs_synth.sequence.replica_files import write_sequence
 
     with Progress(console=Console(stderr=True), transient=True) as progress:

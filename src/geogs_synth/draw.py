@@ -63,7 +63,10 @@ class Draw:
 
 def about_z(angle: Float[Tensor, "..."]) -> Float[Tensor, "... 3 3"]:
     """Rotations about z by angles in radians."""
-    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    c = angle.cos()
+    s = angle.sin()
+    o = torch.zeros_like(angle)
+    i = torch.ones_like(angle)
     return torch.stack([c, -s, o, s, c, o, o, o, i], -1).unflatten(-1, (3, 3))
 
 

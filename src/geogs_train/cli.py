@@ -13,41 +13,42 @@ from geogs_train.training_options import TrainingRunOptions
 
 
 @dataclass(frozen=True)
-class TrainOptions(Settings):
-    """Trains the flow network on random rooms that are made on the fly.
+class _TrainOptions(Settings):
+    """Options of the training of all networks."""
 
-    OUTPUT gets checkpoint.safetensors (to go on with --run.resume), log.jsonl, curves.png and
+    network: Annotated[Literal["flow", "depth"], Positional()]
+    """Network to train."""
+    output: Annotated[Path, Positional()]
+    """Folder to write."""
+    device: str = "auto"
+    """auto (a GPU where there is one), cpu, cuda or cuda:1."""
+    run: TrainingRunOptions = field(default_factory=TrainingRunOptions)
+
+
+@dataclass(frozen=True)
+class TrainOptions(_TrainOptions):
+    """Trains the flow network on random rooms that are rendered on the fly.
+
+    Writes checkpoint.safetensors (--run.resume continues from it), log.jsonl, curves.png and
     flow.safetensors. geogs train depth OUTPUT trains the depth network (geogs train depth --help).
     On several GPUs:
     torchrun --nproc-per-node N -m geogs.cli.main train flow OUTPUT
     """
 
     network: Annotated[Literal["flow"], Positional()]
-    """What to train."""
-    output: Annotated[Path, Positional()]
-    """Folder to write."""
-    device: str = "auto"
-    """auto (a GPU where there is one), cpu, cuda or cuda:1."""
-    run: TrainingRunOptions = field(default_factory=TrainingRunOptions)
     training: FlowTraining = field(default_factory=FlowTraining)
 
 
 @dataclass(frozen=True)
-class TrainDepthOptions(Settings):
-    """Trains the multi-view depth network on random rooms that are made on the fly.
+class TrainDepthOptions(_TrainOptions):
+    """Trains the multi-view depth network on random rooms that are rendered on the fly.
 
-    OUTPUT gets checkpoint.safetensors (to go on with --run.resume), log.jsonl, curves.png and
+    Writes checkpoint.safetensors (--run.resume continues from it), log.jsonl, curves.png and
     depth.safetensors. On several GPUs:
     torchrun --nproc-per-node N -m geogs.cli.main train depth OUTPUT
     """
 
     network: Annotated[Literal["depth"], Positional()]
-    """What to train."""
-    output: Annotated[Path, Positional()]
-    """Folder to write."""
-    device: str = "auto"
-    """auto (a GPU where there is one), cpu, cuda or cuda:1."""
-    run: TrainingRunOptions = field(default_factory=TrainingRunOptions)
     training: DepthTraining = field(default_factory=DepthTraining)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import Field, fields, replace
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -25,7 +25,7 @@ class StepGraph(Generic[Batch]):
     """CUDA graph of the loss of batches of one size; gradients are added in place."""
 
     def __init__(self, work: Callable[[Batch], Float[Tensor, ""]], batch: Batch) -> None:
-        own = {f.name: getattr(batch, f.name).clone() for f in _tensors(batch)}
+        own = {name: getattr(batch, name).clone() for name in _tensors(batch)}
         self._batch: Batch = replace(batch, **own)  # type: ignore[type-var]
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
@@ -39,8 +39,8 @@ class StepGraph(Generic[Batch]):
 
     def __call__(self, batch: Batch) -> Float[Tensor, ""]:
         """Run on another batch of the same size; the loss is overwritten by the next call."""
-        for f in _tensors(batch):
-            getattr(self._batch, f.name).copy_(getattr(batch, f.name))
+        for name in _tensors(batch):
+            getattr(self._batch, name).copy_(getattr(batch, name))
         self._graph.replay()
         return self._loss
 
@@ -56,7 +56,8 @@ class NetworkTrainer:
         self, course: Course, worker: Worker, fuse: bool = False, paced: bool = False
     ) -> None:
         """With ``paced`` the caller sets ``progress``; else it is the fraction of the steps."""
-        self.course, self.worker = course, worker
+        self.course = course
+        self.worker = worker
         self.options = options = course.options
         torch.manual_seed(options.seed)
         self.network = _on_device(course.network(), worker.device)
@@ -71,7 +72,8 @@ class NetworkTrainer:
             fused=worker.device.type == "cuda",
         )
         self.step = 0
-        self.progress, self._paced = 0.0, paced
+        self.progress = 0.0
+        self._paced = paced
         """``progress`` is the finished fraction of the run, on which batch and loss depend."""
         self._graph: StepGraph[Any] | None = None
         if fuse:
@@ -143,5 +145,6 @@ def _flat_gradient(parameters: list[nn.Parameter]) -> Float[Tensor, "n"]:
     return flat
 
 
-def _tensors(batch: Any) -> list[Field[Any]]:
-    return [f for f in fields(batch) if isinstance(getattr(batch, f.name), Tensor)]
+def _tensors(batch: Any) -> list[str]:
+    """Names of the fields that are tensors."""
+    return [name for name, value in vars(batch).items() if isinstance(value, Tensor)]

@@ -61,7 +61,8 @@ def read_options(out: Path, kind: type[T]) -> T:
 def load_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
     """Restore a checkpoint. Raises InputError if there is none or it is damaged."""
     header, tensors = _read(out, with_tensors=True)
-    step, names = int(header["step"]), [name for name, _ in trainer.network.named_parameters()]
+    step = int(header["step"])
+    names = [name for name, _ in trainer.network.named_parameters()]
     parts = {
         part: {k.partition("/")[2]: x for k, x in tensors.items() if k.startswith(f"{part}/")}
         for part in _PARTS
@@ -79,7 +80,8 @@ def load_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
             for k, name in enumerate(names)
         }
     trainer.optimizer.load_state_dict(optimizer)
-    trainer.step, trainer.progress = step, float(header["progress"])
+    trainer.step = step
+    trainer.progress = float(header["progress"])
 
 
 def _revived(kind: type[T], values: dict[str, Any]) -> T:
@@ -103,7 +105,8 @@ def _read(out: Path, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tens
     try:
         with safe_open(str(path), framework="pt") as file:
             names = file.keys() if with_tensors else ()
-            header, tensors = file.metadata() or {}, {n: file.get_tensor(n) for n in names}
+            header = file.metadata() or {}
+            tensors = {n: file.get_tensor(n) for n in names}
     except (SafetensorError, OSError) as error:
         raise InputError(f"The checkpoint in {out} is damaged ({in_short(error)}).") from error
     if not header.keys() >= {"step", "progress", "options"}:

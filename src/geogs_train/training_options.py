@@ -9,40 +9,41 @@ from geogs.config.setting import Count, Positive, Range, Settings, Weight
 
 @dataclass(frozen=True)
 class TrainingSchedule(Settings, group="training"):
-    """What a training run does, whatever it trains; saved with every checkpoint."""
+    """Settings of the training of every network, saved with each checkpoint."""
 
     steps: Annotated[int, Range(1)] = 20_000
-    """Steps of the whole run; the learning rate ends at zero with the last."""
+    """Number of steps of the whole run; the learning rate falls to nearly zero at the last."""
     learning_rate: Positive = 8e-4
-    """Peak, reached after the warm-up."""
+    """Largest learning rate, reached after the warm-up."""
     warmup: Count = 300
-    """Steps in which the learning rate grows from zero."""
+    """Number of first steps over which the learning rate grows from zero."""
     weight_decay: Weight = 1e-4
     """Weight decay of AdamW."""
     clip: Positive = 1.0
-    """Largest norm of a gradient."""
+    """Largest norm of the gradient; a longer one is scaled down to it."""
     ema: Annotated[float, Range(0, below=1)] = 0.999
-    """Decay of the running mean of the weights, which is what is validated and shipped."""
+    """Decay per step of the running mean of the weights, which is validated and shipped."""
     seed: Seed = 0
-    """Seed of everything random."""
+    """Seed of all random numbers."""
 
 
 @dataclass(frozen=True)
 class TrainingRunOptions(Settings, group="run"):
-    """How a run is watched and when it pauses."""
+    """Validation, duration and start of a run."""
 
     validate_every: Count = 1000
-    """Steps between validations, each with a checkpoint."""
+    """Steps between validations; each writes a checkpoint."""
     validation_batches: Count = 8
+    """Number of batches of the validation set."""
     minutes: Annotated[float | None, Range(above=0)] = None
-    """The run stops with a checkpoint after so many minutes, if any; it goes on with ``resume``."""
+    """Minutes after which the run stops with a checkpoint, from which ``resume`` continues."""
     paced: bool = False
-    """Whether the run is as long as its minutes instead of its steps: the learning rate ends at
-    zero with the last minute. How many steps that are depends on the machine, and a run that goes
-    on has its minutes again for what was left."""
+    """Whether ``minutes`` instead of ``steps`` set the length of the run, and with it the learning
+    rate. The number of steps then depends on the machine. A resumed run spends the same minutes on
+    the rest."""
     resume: bool = False
-    """Go on from the checkpoint in the output folder, with its settings."""
+    """Whether to continue from the checkpoint in the output folder, with its settings."""
     begin_with: str = ""
-    """Weights file to begin with; "" for random ones."""
+    """File of the first weights; "" for random weights."""
     fuse: bool = False
-    """Whether the network is compiled; worth its minute on a GPU."""
+    """Whether the network is compiled: that takes a minute and makes steps on a GPU faster."""

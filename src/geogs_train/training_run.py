@@ -25,7 +25,9 @@ class Clock:
     """Finished fraction of a run of given minutes; the fraction ``begun`` was done before."""
 
     def __init__(self, minutes: float, begun: float, worker: Worker) -> None:
-        self._seconds, self._begun, self._worker = 60 * minutes, begun, worker
+        self._seconds = 60 * minutes
+        self._begun = begun
+        self._worker = worker
         self._start = time.monotonic()
 
     def progress(self) -> float:
@@ -55,7 +57,8 @@ def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) ->
     first = worker.rank == 0
     validation = course.validation(run.validation_batches) if first else None
     out.mkdir(parents=True, exist_ok=True)
-    since, at = time.monotonic(), trainer.step
+    since = time.monotonic()
+    at = trainer.step
     clock = Clock(run.minutes, trainer.progress, worker) if run.paced and run.minutes else None
     try:
         while trainer.progress < 1:
@@ -63,22 +66,27 @@ def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) ->
                 trainer.progress = clock.progress()
             loss = trainer.advance()
             if trainer.step % REPORT_EVERY == 0:
-                value, now = float(loss), time.monotonic()
+                value = float(loss)
+                now = time.monotonic()
                 if not trainer.is_finite():
                     raise GeogsError(f"The weights are no longer finite at step {trainer.step}.")
                 rate = (trainer.step - at) / (now - since)
-                since, at = now, trainer.step
+                since = now
+                at = trainer.step
                 if first:
                     entry = {"step": trainer.step, "loss": value, "rate": rate}
                     _log(out, {**entry, "minutes": (now - begin) / 60})
-                    _say(f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
-                         f"loss {value:.3f}  {rate:.1f} steps/s")  # fmt: skip
+                    _say(
+                        f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
+                        f"loss {value:.3f}  {rate:.1f} steps/s"
+                    )
                 late = run.minutes is not None and now - begin > 60 * run.minutes
                 if clock is None and worker.shared(late):
                     break
             if trainer.step % run.validate_every == 0 and validation is not None:
                 _save(trainer, validation, out)
-                since, at = time.monotonic(), trainer.step
+                since = time.monotonic()
+                at = trainer.step
     except KeyboardInterrupt:
         _say("interrupted; writing what there is")
     finally:

@@ -8,14 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.application.calibrate import (
-    self_calibrated,
-)
+from geogs.application.calibrate import self_calibrated
 from geogs.application.interrupt import Interruption
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
-from geogs.tracking.calibration import self_calibration, stretch
+from geogs.tracking.calibration import self_calibration
 from geogs.tracking.calibration.self_calibration import SelfCalibration
 from geogs.tracking.calibration.unknowns import Unknowns
 from progress_listener import Listener
@@ -24,8 +22,8 @@ from tracking_scenes import CAMERA, pose, render
 
 @pytest.fixture(autouse=True)
 def _few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stretch, "START_KEYFRAMES", 8)
-    monkeypatch.setattr(stretch, "KEYFRAMES", 12)
+    monkeypatch.setattr(self_calibration, "START_KEYFRAMES", 8)
+    monkeypatch.setattr(self_calibration, "KEYFRAMES", 12)
 
 
 def write_images(folder: Path, poses: list[np.ndarray]) -> Path:

@@ -134,7 +134,9 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
     )
     result = run(settings, progress, stop)
     assert progress.seen == 18
-    assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
+    stopped = "Stopping early; keeping what there is. Press Ctrl-C again to quit."
+    assert progress.said[-1] == stopped
+    assert progress.said[0].startswith("Input: small-room, ")
     assert result.verdict is None
     assert closing_message(result, 3.0)[0] == NOT_JUDGED
     assert result.folder == tmp_path / "out"
@@ -206,7 +208,7 @@ def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, 
         matches.graph.see_by(matches.camera.moved(0.0, 0.1, -0.05))
         return found
 
-    patch = "geogs.loop.camera.adjustment.correct_lens"
+    patch = "geogs.loop.global_bundle.correct_lens"
     folder = tmp_path / "out"
     argv = [str(small_room), *RUN, "--device", "cpu", "--no-fallback"]
     with monkeypatch.context() as patched:

@@ -11,8 +11,7 @@ from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
 from geogs.application.results.summary import source_summary
 from geogs.application.run_settings import RunSettings
-from geogs.camera.shutter.readout import FoundReadout
-from geogs.camera.shutter.shutter import Shutter
+from geogs.camera.shutter.shutter import FoundReadout, Shutter
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics

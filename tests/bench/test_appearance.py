@@ -19,17 +19,29 @@ from geogs_bench.appearance import appearance_trainer as trainer_module
 from geogs_bench.appearance.appearance_config import AppearanceConfig
 from geogs_bench.appearance.appearance_disks import (
     AppearanceDisks,
+    DiskOptimizer,
+    GradientStatistics,
     constant_from_colour,
     disks_at_points,
+    refine,
+    split_disks,
 )
-from geogs_bench.appearance.appearance_losses import normal_loss, photometric_loss, ssim
-from geogs_bench.appearance.appearance_trainer import AppearanceTrainer
-from geogs_bench.appearance.crossing_depth import crossing_depth, depth_views
-from geogs_bench.appearance.densify import GradientStatistics, refine, split_disks
-from geogs_bench.appearance.disk_optimizer import DiskOptimizer
-from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
-from geogs_bench.appearance.rasteriser import MedianDisks, normals_of_depth, shifted_matrix
-from geogs_bench.appearance.training_schedule import RefinementClock, Schedule
+from geogs_bench.appearance.appearance_trainer import (
+    AppearanceTrainer,
+    RefinementClock,
+    Schedule,
+    normal_loss,
+    photometric_loss,
+    ssim,
+)
+from geogs_bench.appearance.rasteriser import (
+    GsplatRasteriser,
+    MedianDisks,
+    crossing_depth,
+    depth_views,
+    normals_of_depth,
+    shifted_matrix,
+)
 from geogs_bench.appearance.training_views import TrainingView, scene_scale
 from geogs_photos.start_points import find_start_points, in_visual_hull
 from oracles.appearance_reference import ReferenceRasteriser, basis, view_colours

@@ -1,6 +1,7 @@
 """The board: its sequences, what a command took, what counts as worse, and a row end to end."""
 
 import json
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -9,20 +10,15 @@ import pytest
 from geogs.cli import main as cli
 from geogs.errors import InputError, OutputError
 from geogs.io.sources.sniff import open_source
+from geogs_bench.bench_options import BenchOptions
 from geogs_bench.board import board as board_module
 from geogs_bench.board import footage as footage_module
-from geogs_bench.board.board_record import (
-    BoardRecord,
-    Outcome,
-    RowRecord,
-    read_board,
-    write_board,
-)
-from geogs_bench.board.board_table import markdown
+from geogs_bench.board.board_record import BoardRecord, Outcome, RowRecord, read_board, write_board
 from geogs_bench.board.commands import Spent, run_geogs
-from geogs_bench.board.comparison import FIGURES, compare
+from geogs_bench.board.comparison import FIGURES, compare, markdown
 from geogs_bench.board.footage import Footage, KeptFootage, Size, find, frames_used, render
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
+from geogs_bench.board.sensitivity import sensitivity, table
 
 TINY = Size(10, 96, 72)
 
@@ -232,3 +228,49 @@ def test_a_row_end_to_end(tmp_path, monkeypatch, capsys):
     assert cli.main(again) == 0
     first = json.loads((output / "board.json").read_text())["rows"][0]
     assert first["outcomes"] == [vars(outcome) for outcome in good.outcomes]
+
+
+def test_a_constant_is_changed_before_others_import_it(tmp_path):
+    """A process with another value sees it in the module and where it was imported from there."""
+    code = (
+        "from geogs_bench.board.with_constant import Constant, change\n"
+        "change(Constant.named('geogs.depth.revision.revised_searches:MIN_GAP'), 0.5)\n"
+        "from geogs.depth.revision import revised_searches as owner\n"
+        "print(owner.MIN_GAP)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0.5"]
+
+
+def test_constants_are_halved_and_doubled_on_the_board(tmp_path, monkeypatch):
+    """A row that gets worse is named; one that stays is flat."""
+    seen = []
+
+    def run(self):
+        seen.append((self.output.name, self.changed and self.changed[1]))
+        is_worse = self.changed is not None and self.changed[1] > 0.03
+        return a_board(with_ate(*((2.0, 2.1, 2.05) if is_worse else (1.0, 1.1, 1.05))))
+
+    monkeypatch.setattr(board_module.Board, "run", run)
+    monkeypatch.setattr(board_module, "reference_seconds", lambda: 1.0)
+    words = "geogs.depth.revision.revised_searches:MIN_GAP"
+    options = BenchOptions("sensitivity", output=tmp_path, constants=(words,), device="cpu")
+    (found,) = sensitivity(options, print)
+    assert [value for _, value in seen] == [None, 0.015, 0.06]
+    assert not found.is_flat
+    assert "| flat | worse: room, ATE cm" in table([found])
+    assert (tmp_path / "sensitivity.md").read_text() == table([found])
+
+
+@pytest.mark.parametrize(
+    ("constant", "message"),
+    [
+        ("geogs.depth.edges", "MODULE:NAME"),
+        ("geogs.depth.edges:NONE", "does not exist"),
+        ("geogs.depth.edges:__name__", "no single number"),
+    ],
+)
+def test_what_is_no_constant_is_refused(constant, message, tmp_path):
+    options = BenchOptions("sensitivity", output=tmp_path, constants=(constant,), device="cpu")
+    with pytest.raises(InputError, match=message):
+        sensitivity(options, print)

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from geogs.cli import main as cli
-from geogs_bench.bench import listing
-from geogs_bench.catalogue.registry import find_benchmark
+from geogs_bench.bench import find_benchmark, listing
 from geogs_bench.plan import Selection, find_scenes, make_jobs
 from geogs_bench.runners.runner import Runner
 

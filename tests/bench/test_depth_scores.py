@@ -16,7 +16,8 @@ from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 from geogs_bench.bench import bench
 from geogs_bench.bench_options import BenchOptions
-from geogs_bench.data.depth_scenes import CELLS, find_depth
+from geogs_bench.data.motion_cells import DEPTH_CELLS
+from geogs_bench.data.scenes import find_depth
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.depth_pictures import error_colours
 from geogs_bench.scoring.depth_scores import one_scale, score_depth
@@ -235,4 +236,4 @@ def test_sequences_with_depth_are_found_in_every_layout(tmp_path) -> None:
     assert list(found) == ["hall", "kinect"]
     assert {scene.kind for scene in found.values()} == {"depth"}
     assert found["kinect"].truth.poses is None
-    assert len({cell.name for cell in CELLS}) == len(CELLS)
+    assert len({cell.name for cell in DEPTH_CELLS}) == len(DEPTH_CELLS)

@@ -10,10 +10,9 @@ from bench_results import FakeRunner, options_of, write_truth
 from geogs.errors import InputError
 from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
-from geogs_bench.harness import Harness
+from geogs_bench.harness import Harness, clear
 from geogs_bench.machine import machine_name, program_version
 from geogs_bench.plan import Selection, make_jobs, merged
-from geogs_bench.results.store import clear
 from geogs_bench.tables.columns import COST, area_layout, trajectory_layout
 
 

@@ -8,12 +8,16 @@ import pytest
 from flat_rooms import SIZE, flat_room
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
-from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
+from geogs_bench.bench import BENCHMARKS, find_benchmark
 from geogs_bench.data.benchmark_scene import Option
-from geogs_bench.data.dtu_scenes import find_dtu
-from geogs_bench.data.posed_scenes import find_any_posed, find_objects, find_posed_rooms
-from geogs_bench.data.replica_scenes import find_relighted, find_replica, find_rooms
-from geogs_bench.data.sequence_scenes import (
+from geogs_bench.data.scenes import (
+    find_any_posed,
+    find_dtu,
+    find_objects,
+    find_posed_rooms,
+    find_relighted,
+    find_replica,
+    find_rooms,
     find_scannet,
     find_scannetpp,
     find_seven_scenes,

@@ -11,12 +11,12 @@ from flat_rooms import SIZE, flat_room
 from geogs.cli import main as cli
 from geogs.errors import InputError
 from geogs_bench import published as paper
+from geogs_bench.bench import SuitePart, run_parts, suite_parts
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.catalogue.paper_tables import PAPER_TABLES, PAPER_TABLES_SMALL, SUITES
 from geogs_bench.harness import Harness
 from geogs_bench.plan import Selection
 from geogs_bench.runners.runner import Runner
-from geogs_bench.suite import SuitePart, run_parts, suite_parts
 from io_samples import write_images
 from posed_layouts import write_colmap_text, write_dtu, write_scannet
 
@@ -47,7 +47,7 @@ def stand_ins(monkeypatch, small_room) -> list[str]:
             shutil.copytree(small_room, folder / cell.name)
         return folder
 
-    monkeypatch.setattr("geogs_bench.suite.render_cells", render)
+    monkeypatch.setattr("geogs_bench.bench.render_cells", render)
     monkeypatch.setattr("geogs_bench.scoring.scores.draw", lambda *_: None)
     return asked
 

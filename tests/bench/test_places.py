@@ -7,9 +7,17 @@ from scipy import ndimage
 
 from geogs.geometry.camera import Camera
 from geogs_bench.results.record import Place
-from geogs_bench.scoring import places
-from geogs_bench.scoring.places import BEHIND, JUMP, LONG, NEAR_EDGE, THIN, inverse_depth, places_of
-from geogs_bench.scoring.plane_fits import fit_planes
+from geogs_bench.scoring import depth_scores
+from geogs_bench.scoring.depth_scores import (
+    BEHIND,
+    JUMP,
+    LONG,
+    NEAR_EDGE,
+    THIN,
+    fit_planes,
+    inverse_depth,
+    places_of,
+)
 
 CAMERA = Camera(100.0, 90.0, 59.5, 44.5, 120, 90)
 SHAPE = (90, 120)
@@ -148,7 +156,7 @@ def test_grazing_is_by_the_ray_not_by_the_axis() -> None:
     rays = CAMERA.rays(torch.float64).numpy()[v, u]
     angle = np.degrees(np.arccos(rays[:, 1] / np.linalg.norm(rays, axis=1)))
     inside = (v > depth.nonzero()[0].min() + 4) & (v < 86) & (u > 3) & (u < 116)
-    np.testing.assert_array_equal(found[v, u][inside], (angle > places.GRAZING)[inside])
+    np.testing.assert_array_equal(found[v, u][inside], (angle > depth_scores.GRAZING)[inside])
     assert found.any()
 
 
@@ -188,7 +196,7 @@ def test_edges_are_those_of_a_walk_from_pixel_to_pixel(seed: int) -> None:
                     rests.append(abs(step - (line[q] - line[b]) / (q - b) * (b - a)))
                 if b - a <= 32 and min(rests) > JUMP * max(line[a], line[b]):
                     marks[r, a] = marks[r, b] = True
-    np.testing.assert_array_equal(places.edges(inverse), expected)
+    np.testing.assert_array_equal(depth_scores.edges(inverse), expected)
     assert 0.01 < expected.mean() < 0.5
 
 
@@ -212,7 +220,7 @@ def test_thin_is_what_no_square_covers(seed: int) -> None:
         v, u = np.nonzero(parts == part)
         if max(np.ptp(v), np.ptp(u)) + 1 >= LONG:
             expected |= parts == part
-    np.testing.assert_array_equal(places.thin_things(inverse), expected)
+    np.testing.assert_array_equal(depth_scores.thin_things(inverse), expected)
     assert 0.01 < expected.mean() < 0.3
 
 

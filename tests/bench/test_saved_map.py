@@ -8,8 +8,7 @@ import pytest
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.map_file import load_map
 from geogs_bench.data.benchmark_scene import Option
-from geogs_bench.runners.runner import Runner
-from geogs_bench.runners.saved_map import FOLDER
+from geogs_bench.runners.runner import FOLDER, Runner
 from geogs_bench.runners.task import Task
 
 pytestmark = pytest.mark.system

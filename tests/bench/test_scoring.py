@@ -28,8 +28,7 @@ from geogs_bench.results.record import (
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.room_scores import with_short_edges
 from geogs_bench.scoring.scores import scored
-from geogs_bench.tables.benchmark_report import Chapter, markdown, write_report
-from geogs_bench.tables.result_tables import result_tables
+from geogs_bench.tables.benchmark_report import Chapter, markdown, result_tables, write_report
 from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
@@ -185,9 +184,7 @@ def test_coarse_triangles_are_cut_without_changing_the_surface():
 
 def test_records_survive_json_and_damage(tmp_path):
     full = replace(
-        record("room0"),
-        curve=(CurvePoint(5.0, None, surface("area")),),
-        error="The disk was full.",
+        record("room0"), curve=(CurvePoint(5.0, None, surface("area")),), error="The disk was full."
     )
     write_json(tmp_path / "bench.json", full)
     assert read_record(tmp_path / "bench.json") == full
@@ -294,7 +291,7 @@ def test_published_tables_are_complete_and_their_means_are_those_printed():
 @pytest.mark.long
 def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
     from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
-    from geogs_synth.sequence.scene_mesh import scene_mesh
+    from geogs_synth.scene.textured_scene import scene_mesh
     from posed_layouts import render_room, write_dtu
 
     room = render_room(6, 12, 160, 120)
@@ -323,7 +320,7 @@ def test_a_dtu_scan_is_scored_by_its_own_protocol_in_millimetres(tmp_path):
     from scipy.io import savemat
 
     from flat_rooms import flat_room
-    from geogs_bench.data.dtu_scenes import find_dtu
+    from geogs_bench.data.scenes import find_dtu
     from posed_layouts import write_dtu
 
     shutil.rmtree(write_dtu(flat_room(), tmp_path / "scan7") / "mask")

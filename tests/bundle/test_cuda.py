@@ -15,14 +15,13 @@ import geogs.bundle.cuda.motion_only as cuda_motion
 from bundle_scenes import on
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.fields import GridFields
 from geogs.bundle.keyframe_pairs import KeyframePairs
 from geogs.bundle.motion_only import MotionSolver
-from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.bundle.protocols import BundleOptions, BundleResult
+from geogs.bundle.terms import DepthDamping, MeasuredDepths, MeasuredMotions
 from geogs.config import Config
 from geogs.geometry.camera import LEAST_SLOPE, Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse

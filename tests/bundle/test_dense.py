@@ -7,10 +7,10 @@ import torch
 
 from bundle_scenes import CAMERA, disturbed, scene
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import DepthDamping, MeasuredDepths
 from geogs.geometry.lie import retract, se3_inverse
 from oracles.bundle_reference import gauss_newton_step
 

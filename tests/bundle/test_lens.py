@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.lens import LensBlock, lens_rays
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import retract
 from lens_scene import CAMERA, GRID, lens_problem
@@ -41,7 +41,7 @@ def test_the_lens_is_that_of_opencv():
     lens = CAMERA.moved(0.0, -0.12, 0.03)
     K, distortion = CAMERA.matrix().numpy(), np.array([-0.12, 0.03, 0, 0])
     pixels = GRID.pixels.double()
-    rays = lens_rays(lens, pixels).rays
+    rays = LensBlock(lens, pixels).rays
     back, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), K, distortion)
     np.testing.assert_allclose(back[:, 0], pixels.numpy(), atol=1e-7)
     eye, same = torch.eye(4, dtype=torch.float64)[None], torch.zeros(1, dtype=torch.long)

@@ -64,7 +64,7 @@ def test_equations_are_those_of_plain_pytorch(distortion, shared):
             assert close(edges.gradient[at:], v[:, 6:].sum(0))
             assert close(edges.depth.coupling[at:], E[:, 6:].sum(0))
         assert torch.equal(edges.hessian, edges.hessian.mT)
-        assert close(source.information, wanted.curvature[e].sum(0))
+        assert close(source.edges.depth.information, wanted.curvature[e].sum(0))
         assert close(edges.depth.gradient, wanted.pull[e].sum(0))
 
 

@@ -12,14 +12,12 @@ import geogs.bundle.cuda.streamed as cuda_streamed
 from bundle_scenes import CAMERA, disturbed, on, scene, streamed
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle, DenseSchur
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.lens_flow import LensFlow
-from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle, StreamedSchur
-from geogs.bundle.terms import BundleState
+from geogs.bundle.terms import BundleState, DepthDamping, MeasuredDepths, MeasuredMotions
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.world.grid import SampleGrid
 from oracles.bundle_reference import robust_cost

@@ -35,7 +35,9 @@ def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
         torch.testing.assert_close(
             own.gradient[:at] / scale, theirs.gradient / scale, rtol=1e-4, atol=1e-2
         )
-        torch.testing.assert_close(source.information, tracked.information, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(
+            own.depth.information, theirs.depth.information, rtol=1e-4, atol=1e-3
+        )
 
 
 @pytest.mark.parametrize("huber", [0.5, 50.0])

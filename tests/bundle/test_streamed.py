@@ -7,9 +7,9 @@ import torch
 
 from bundle_scenes import disturbed, scene, streamed
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
+from geogs.bundle.terms import DepthDamping, MeasuredDepths
 
 
 @pytest.mark.parametrize("chunk", [1, 100])

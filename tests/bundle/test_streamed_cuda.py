@@ -9,9 +9,8 @@ import geogs.bundle.cuda.streamed as cuda_streamed
 from bundle_scenes import disturbed, on, scene, streamed
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
-from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import DepthDamping, MeasuredDepths, MeasuredMotions
 from geogs.world.grid import SampleGrid
 
 

@@ -84,9 +84,10 @@ def test_a_run_imports_before_its_first_frame_only_what_that_needs():
     """What keyframes, maps, meshes and reports need comes with the first of them."""
     later = ("numba", "scipy", "skimage", "matplotlib", "PIL", "av", "onnxruntime", "yaml")
     code = (
-        "import sys, geogs.application.run, geogs.application.progress.terminal_progress; "
+        "import sys, geogs.slam, geogs.application.run; "
+        "import geogs.application.progress.terminal_progress; "
         "from geogs.geometry.camera import Camera; "
-        "geogs.application.run.Slam(Camera(300.0, 300.0, 160.0, 120.0, 320, 240), device='cpu'); "
+        "geogs.slam.Slam(Camera(300.0, 300.0, 160.0, 120.0, 320, 240), device='cpu'); "
         f"print([m for m in {later} if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

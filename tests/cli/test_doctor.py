@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from geogs.application.machine import doctor, self_test
+from geogs.application.machine import doctor
 from geogs.cli.doctor import main
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
@@ -63,11 +63,11 @@ def test_a_python_that_keeps_no_bytecode_is_slow(monkeypatch, capsys, tmp_path):
 
 def test_wrong_results_fail(monkeypatch, capsys):
     def wrong(*args, **kwargs):
-        output = self_test_render(*args, **kwargs)
+        output = true_render(*args, **kwargs)
         return replace(output, normal=1.01 * output.normal)
 
-    self_test_render = self_test.render
-    monkeypatch.setattr(self_test, "render", wrong)
+    true_render = doctor.render
+    monkeypatch.setattr(doctor, "render", wrong)
     assert main(["--device", "cpu"]) == 2
     text = capsys.readouterr().out
     assert "BAD" in text
@@ -78,16 +78,16 @@ def test_crash_of_the_renderer_is_one_line(monkeypatch, capsys):
     def crash(*args, **kwargs):
         raise RuntimeError("no kernel image is available\nand more")
 
-    monkeypatch.setattr(self_test, "render", crash)
+    monkeypatch.setattr(doctor, "render", crash)
     assert main(["--device", "cpu"]) == 2
     text = capsys.readouterr().out
     assert "does not run on cpu (RuntimeError: no kernel image is available)." in text
 
 
 def test_agreement_bounds():
-    assert self_test.Agreement(1e-5, 1e-4).is_good
-    assert not self_test.Agreement(1e-2, 1e-4).is_good
-    assert not self_test.Agreement(1e-5, float("nan")).is_good
+    assert doctor.Agreement(1e-5, 1e-4).is_good
+    assert not doctor.Agreement(1e-2, 1e-4).is_good
+    assert not doctor.Agreement(1e-5, float("nan")).is_good
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_driver_without_cuda_build_is_to_be_mended(machine, capsys):
 def test_cache_state(monkeypatch, tmp_path):
     monkeypatch.setenv("GEOGS_CACHE", str(tmp_path / "new"))
     assert cache.cache_state() == cache.CacheState(0, 0, None)
-    assert cache.write_cubin("key", b"12345")
+    cache.write_cubin("key", b"12345")
     assert cache.cache_state() == cache.CacheState(1, 32 + 5, None)
     (tmp_path / "file").touch()
     monkeypatch.setenv("GEOGS_CACHE", str(tmp_path / "file"))

@@ -28,10 +28,7 @@ CASES = {
     "--mapping.when after --mapping.final-iterations 0": "mapping.when after does nothing",
     "--loop.matches --loop.no-enabled": "loop.matches does nothing",
     "--mapping.depth.engine classical --mapping.depth.weights x": "the engine classical has none",
-    "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",
-    "--mapping.loss.occlusion-ratio 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
     "--mapping.loss.colour --mapping.loss.l1-weight 0": "mapping.loss.colour does nothing",
-    "--mapping.loss.measured-factor 2": "mapping.loss.measured-factor does nothing",
     "--prior.card omnidata": "prior.card does nothing",
     "--prior.normal-card omnidata": "prior.normal-card does nothing",
 }
@@ -85,6 +82,3 @@ def test_what_is_heeded_says_nothing() -> None:
     assert said("run", "--tracking.weights", "x.pth", "--tracking.operator", "droid") == []
     assert said("run", "--mapping.no-final-depth") == []
     assert said("run", "--mapping.final-iterations", "0") == []
-    edges = ["--mapping.loss.ablation.smoothness-rewards-edges"]
-    assert said("run", "--mapping.loss.smoothness-weight", "1", *edges) == []
-    assert "rewards-edges" in said("reconstruct", *edges)[0]

@@ -26,3 +26,5 @@ def test_every_setting_has_a_row_with_its_default_its_range_and_its_meaning():
     explained = [row for row in rows if " only) |" in row]
     lag = next(row for row in explained if row.startswith("| `mapping.lag`"))
     assert lag.endswith("(`run` only) |")
+    opacity = next(row for row in explained if row.startswith("| `mapping.disk.opacity`"))
+    assert opacity.endswith("(Python only) |")

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from geogs.gpu.kernel_source import KernelSignature, kernel_signatures, read_source
+from geogs.gpu.kernel_source import kernel_signatures, read_source
 
 HERE = Path(__file__).parent
 _POINTERS = {
@@ -31,30 +31,29 @@ _NUMBERS = {"int": ctypes.c_int, "float": ctypes.c_float, "unsigned": ctypes.c_u
 class EmulatedKernel:
     """A kernel of an emulated library; called like the real one."""
 
-    def __init__(self, function, signature: KernelSignature) -> None:
-        self._function, self._signature = function, signature
+    def __init__(self, function, name: str, parameters: tuple[str, ...]) -> None:
+        self._function = function
+        self._name = name
+        self._parameters = parameters
 
     def __call__(self, grid, block, *arguments, shared: int = 0) -> None:
-        signature = self._signature
-        assert len(arguments) == len(signature.parameters), signature
-        values = [
-            self._convert(*pair) for pair in zip(signature.parameters, arguments, strict=True)
-        ]
+        assert len(arguments) == len(self._parameters), self._name
+        values = [self._convert(*pair) for pair in zip(self._parameters, arguments, strict=True)]
         array = (ctypes.c_void_p * len(values))(*(ctypes.addressof(v) for v in values))
         sizes = [(ctypes.c_uint * 3)(*_three(s)) for s in (grid, block)]
         self._function(*sizes, ctypes.c_size_t(shared), array)
 
     def _convert(self, kind: str, value):
         if not kind.endswith("*"):
-            assert not isinstance(value, torch.Tensor), (self._signature.name, kind)
+            assert not isinstance(value, torch.Tensor), (self._name, kind)
             return _NUMBERS[kind](value)
         if value is None:
             return ctypes.c_void_p(0)
-        assert value.device.type == "cpu", self._signature.name
-        assert value.is_contiguous(), (self._signature.name, kind, value.shape, value.stride())
+        assert value.device.type == "cpu", self._name
+        assert value.is_contiguous(), (self._name, kind, value.shape, value.stride())
         expected = _POINTERS[kind]
         allowed = {expected, torch.bool} if expected == torch.uint8 else {expected}
-        assert value.dtype in allowed, (self._signature.name, kind, value.dtype)
+        assert value.dtype in allowed, (self._name, kind, value.dtype)
         return ctypes.c_void_p(value.data_ptr())
 
 
@@ -67,7 +66,7 @@ def emulated_kernels(source: Path) -> dict[str, EmulatedKernel]:
     text = read_source(source)
     signatures = kernel_signatures(text)
     program = '#include "emulator.h"\n' + text + '\nextern "C" {\n'
-    program += "".join(_runner(s) for s in signatures.values()) + "}\n"
+    program += "".join(_runner(*signature) for signature in signatures.items()) + "}\n"
     key = hashlib.sha256((program + (HERE / "emulator.h").read_text()).encode()).hexdigest()[:24]
     folder = Path(tempfile.gettempdir()) / "geogs-emulated"
     folder.mkdir(exist_ok=True)
@@ -82,7 +81,7 @@ def emulated_kernels(source: Path) -> dict[str, EmulatedKernel]:
             subprocess.run([*command, "-o", str(binary), str(code)], check=True)
             binary.replace(library)
     loaded = ctypes.CDLL(str(library))
-    return {n: EmulatedKernel(getattr(loaded, f"emu_{n}"), s) for n, s in signatures.items()}
+    return {n: EmulatedKernel(getattr(loaded, f"emu_{n}"), n, s) for n, s in signatures.items()}
 
 
 def use_emulator(monkeypatch: pytest.MonkeyPatch, *modules) -> None:
@@ -91,11 +90,11 @@ def use_emulator(monkeypatch: pytest.MonkeyPatch, *modules) -> None:
         monkeypatch.setattr(module, "kernels_for", lambda source, device: emulated_kernels(source))
 
 
-def _runner(signature: KernelSignature) -> str:
-    values = ", ".join(f"*({kind}*)a[{i}]" for i, kind in enumerate(signature.parameters))
+def _runner(name: str, parameters: tuple[str, ...]) -> str:
+    values = ", ".join(f"*({kind}*)a[{i}]" for i, kind in enumerate(parameters))
     return (
-        f"void emu_{signature.name}(const unsigned* g, const unsigned* b, size_t s, void** a) "
-        f"{{ emu_run(g, b, s, [=] {{ {signature.name}({values}); }}); }}\n"
+        f"void emu_{name}(const unsigned* g, const unsigned* b, size_t s, void** a) "
+        f"{{ emu_run(g, b, s, [=] {{ {name}({values}); }}); }}\n"
     )
 
 

@@ -16,11 +16,10 @@ from geogs.depth import refinement as cpu_refinement
 from geogs.depth.carve import vote
 from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.confidence import depth_confidence
-from geogs.depth.cuda import edges as edges_module
-from geogs.depth.cuda import fusion as check_module
-from geogs.depth.cuda import grid_completion as completion_module
+from geogs.depth.cuda import classical as engine_module
 from geogs.depth.cuda import plane_sweep as sweep_module
 from geogs.depth.cuda import refinement as refine_module
+from geogs.depth.cuda import revision as check_module
 from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.cuda.images import KeyframeImages, packed
 from geogs.depth.cuda.plane_sweep import PlaneSlots, SweptDepth
@@ -80,9 +79,7 @@ def setting(
 ) -> Setting:
     """A few pixels in the emulator; the real size on a GPU."""
     if request.param == "emulated":
-        use_emulator(
-            monkeypatch, completion_module, sweep_module, refine_module, edges_module, check_module
-        )
+        use_emulator(monkeypatch, engine_module, sweep_module, refine_module, check_module)
         monkeypatch.setattr(cpu_sweep, "SUPPORT_RADIUS", 2)
         most_planes, device, size = 29, "cpu", (WORKING.resized(37, 30), 1.6)
     elif torch.cuda.is_available():
@@ -240,16 +237,12 @@ def test_completed_grids(setting, shape):
         known = known_cells(grid, information)
         done = complete_grid(grid, information, smooth)
         assert not done.inlier[1, 2]
-        evidence = (
-            done.inverse_depth,
-            prior_weight(done),
-            relative_precision(done),
-        )
+        evidence = (done.inverse_depth, prior_weight(done), relative_precision(done))
         grids.append(np.stack([grid, information, smooth]))
         typical.append(float(np.median(grid[known])))
         expected.append(np.stack(evidence))
-    assert completion_module.can_complete(shape, setting.device)
-    out = completion_module.complete(_to(setting, np.stack(grids)), typical).cpu()
+    assert engine_module.can_complete(shape, setting.device)
+    out = engine_module.complete(_to(setting, np.stack(grids)), typical).cpu()
     for got, want in zip(out, expected, strict=True):
         assert np.abs(got[0].numpy() / want[0] - 1).max() < 1e-5
         _close(got[1], want[1], 1e-5)
@@ -257,7 +250,7 @@ def test_completed_grids(setting, shape):
 
 
 def test_grids_too_large_for_the_gpu_or_without_knowledge_are_completed_on_the_cpu(setting):
-    assert not completion_module.can_complete((120, 100), setting.device)
+    assert not engine_module.can_complete((120, 100), setting.device)
     _, cuda = _engines(setting)
     view = setting.scene.views[0]
     lost = replace(view, information=0 * view.information)
@@ -358,7 +351,7 @@ def test_edges(setting):
     zero = _to(setting, 0 * confidence)
     costs = _by_slot(setting, swept.costs, slots)
     planes = (refined.inverse_depth, refined.slope_x, refined.slope_y, refined.support)
-    got, got_sure = edges_module.resolve_edges(
+    got, got_sure = refine_module.resolve_edges(
         SlantedMaps(*(_to(setting, m) for m in planes)), _to(setting, confidence),
         _to(setting, guide), SweptDepth(zero, zero, zero, slots, costs),
     )  # fmt: skip

@@ -17,8 +17,7 @@ from geogs.evaluation.surfaces.silhouettes import (
     mesh_silhouettes,
 )
 from geogs.evaluation.surfaces.surface import Surface, read_surface
-from geogs.evaluation.surfaces.surface_distance import closest_point_on_triangle
-from geogs.evaluation.surfaces.triangle_tree import TriangleTree
+from geogs.evaluation.surfaces.surface_distance import TriangleTree, closest_point_on_triangle
 from geogs.geometry.camera import Camera
 from surface_shapes import CAMERA, NO_FACES, joined, moved, plane
 

@@ -6,12 +6,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from geogs.errors import InputError
-from geogs.evaluation.surfaces.photoconsistency import (
-    EvaluatedPhoto,
-    choose_neighbours,
-    evaluate_photoconsistency,
-)
+from geogs.evaluation.surfaces.photoconsistency import choose_neighbours, evaluate_photoconsistency
 from geogs.geometry.lie import so3_exp
+from geogs.io.sources.posed.posed_source import PosedImage
 from surface_shapes import CAMERA, joined, plane
 
 
@@ -36,12 +33,16 @@ def photograph(T_cw: np.ndarray, texture: np.ndarray) -> np.ndarray:
     return np.repeat(grey.round().clip(0, 255).astype(np.uint8)[..., None], 3, 2)
 
 
+def posed(image: np.ndarray, T_cw: np.ndarray, mask: np.ndarray | None = None) -> PosedImage:
+    return PosedImage(0, "", 0.0, image, T_cw, mask)
+
+
 @pytest.fixture(scope="module")
-def views() -> list[EvaluatedPhoto]:
+def views() -> list[PosedImage]:
     rough = gaussian_filter(np.random.default_rng(0).normal(size=(401, 401)), 2.0)
     texture = 128 + 60 * rough / rough.std()
     poses = [arc(a) for a in (0.0, 12.0, -12.0)]
-    return [EvaluatedPhoto(photograph(T, texture), T) for T in poses]
+    return [posed(photograph(T, texture), T) for T in poses]
 
 
 def score(mesh, views):
@@ -88,7 +89,7 @@ def test_what_is_hidden_in_the_neighbour_is_not_compared(views):
 def test_masks_limit_what_counts(views):
     mask = np.zeros((120, 160), bool)
     mask[40:80, 60:100] = True
-    view = EvaluatedPhoto(views[0].image, views[0].T_cw, mask)
+    view = posed(views[0].image, views[0].T_cw, mask)
     small = plane(2.0, half=0.45)  # 45 pixels, more than the mask
     assert score(small, [view, *views[1:]]).coverage == 100
     assert score(small, views).coverage == pytest.approx(100 * 45**2 / (160 * 120), abs=1)
@@ -100,10 +101,10 @@ def test_neighbours_by_poses_alone():
     outwards = [arc(0.0, -2.0), arc(12.0, -2.0)]
     assert choose_neighbours(0, outwards, 3) == []
     with pytest.raises(InputError, match="from another side"):
-        score(plane(2.0), [EvaluatedPhoto(np.zeros((120, 160, 3), np.uint8), np.eye(4))])
+        score(plane(2.0), [posed(np.zeros((120, 160, 3), np.uint8), np.eye(4))])
 
 
 def test_plain_images_cannot_be_judged(views):
-    plain = [EvaluatedPhoto(np.full_like(v.image, 90), v.T_cw) for v in views]
+    plain = [posed(np.full_like(v.image, 90), v.T_cw) for v in views]
     with pytest.raises(InputError, match="no texture"):
         score(plane(2.0, half=2.0), plain)

@@ -8,15 +8,8 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.icp import icp
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.evaluation.surfaces.reconstruction_errors import evaluate_reconstruction
-from geogs.evaluation.surfaces.surface import (
-    Surface,
-    read_surface,
-    sample_surface,
-)
-from geogs.evaluation.surfaces.surface_distance import (
-    SurfaceDistance,
-    closest_point_on_triangle,
-)
+from geogs.evaluation.surfaces.surface import Surface, read_surface, sample_surface
+from geogs.evaluation.surfaces.surface_distance import SurfaceDistance, closest_point_on_triangle
 from geogs.evaluation.surfaces.visibility import Visibility
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.ply_writer import write_mesh

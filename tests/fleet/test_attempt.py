@@ -13,13 +13,13 @@ import pytest
 from disk_faults import full_disk
 from geogs.application.checkpoints import folder as checkpoint_folder
 from geogs.application.run_settings import RunSettings
-from geogs_fleet import work_folder
+from geogs_fleet import attempt as attempt_module
 from geogs_fleet.attempt import LOG, FleetJob, attempt, judged
 from geogs_fleet.child import THUMBNAIL, write_thumbnail
-from geogs_fleet.row import FILE, read_row
 from geogs_fleet.sources import FleetSource
 from geogs_fleet.storage import StoragePath
 from geogs_fleet.supervise import Limits, ProcessEnd
+from geogs_fleet.table import FILE, read_row
 
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_child.py")))
 
@@ -124,18 +124,18 @@ def test_what_an_ending_means(ending, state, said):
 
 
 def test_the_name_of_the_manifest_is_that_of_checkpoints():
-    assert work_folder._MANIFEST == checkpoint_folder.MANIFEST
+    assert attempt_module._MANIFEST == checkpoint_folder.MANIFEST
 
 
 def test_a_checkpoint_elsewhere_moves_between_nodes_and_its_manifest_comes_last(tmp_path):
     pytest.importorskip("fsspec", reason="fsspec is not installed")
     far = StoragePath(f"memory://{uuid.uuid4().hex}")
-    first = work_folder.WorkFolder(far)
+    first = attempt_module.WorkFolder(far)
     (first.path / "checkpoint").mkdir()
     for name in ("manifest.json", "state-1.json", ".manifest.json.part"):
         (first.path / "checkpoint" / name).write_text(name)
     first.keep_checkpoint()
     assert set((far / "checkpoint").listed()) == {"manifest.json", "state-1.json"}
     (first.path / "checkpoint" / "state-1.json").unlink()
-    second = work_folder.WorkFolder(far)  # what is here gives way to what is there
+    second = attempt_module.WorkFolder(far)  # what is here gives way to what is there
     assert (second.path / "checkpoint" / "state-1.json").read_text() == "state-1.json"

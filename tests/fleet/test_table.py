@@ -5,9 +5,8 @@ import json
 import pytest
 
 from geogs_fleet.fleet_progress import Pace
-from geogs_fleet.row import Row, read_row, row_text
 from geogs_fleet.storage import StoragePath
-from geogs_fleet.table import write_table
+from geogs_fleet.table import Row, read_row, row_text, write_table
 
 ROWS = [
     Row("good", "/s/good.mp4", "done", "Fine.", "d", True, 3.0, 1, "n", {"lost": 0.0}),

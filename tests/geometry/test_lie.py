@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geogs.geometry import lie
-from geogs.geometry.sim3_translation import TranslationMap
+from geogs.geometry.lie import TranslationMap
 
 F64 = torch.float64
 GROUPS = {

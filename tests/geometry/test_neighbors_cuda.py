@@ -8,9 +8,12 @@ from geogs.config import DiskConfig
 from geogs.geometry import neighbors
 from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
 from geogs.splat import init
-from geogs.splat.cuda import local_planes
-from geogs.splat.cuda.local_planes import principal_planes
-from geogs.splat.init import fit_local_planes, fit_local_planes_on_gpu, initialise_disks
+from geogs.splat.init import (
+    fit_local_planes,
+    fit_local_planes_on_gpu,
+    initialise_disks,
+    principal_planes,
+)
 
 GPU = pytest.param(
     "cuda",
@@ -26,7 +29,7 @@ CONFIG = DiskConfig(planarity_shrink=0.1)
 def device(request, monkeypatch):
     """The kernels emulated on the CPU, or on a GPU."""
     if request.param == "cpu":
-        use_emulator(monkeypatch, neighbors, local_planes)
+        use_emulator(monkeypatch, neighbors, init)
     return torch.device(request.param)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from geogs.application.machine import doctor
 from geogs.errors import DeviceError
-from geogs.gpu import binaries, build_binaries, cuda_driver, kernels
+from geogs.gpu import binaries, build_binaries, kernels
 from geogs.gpu.binaries import MACHINE_CODE, PTX, shipped_code, shipped_sources, usable_by
 from geogs.gpu.kernel_source import PACKAGE, kernel_sources, read_source
 from geogs.gpu.nvrtc import Nvrtc
@@ -50,10 +50,10 @@ def machine(monkeypatch):
             loaded.append(code)
             if code.startswith(refused):
                 raise DeviceError("The driver cannot load the compiled kernels.")
-            return {s.name: code.decode for s in signatures}
+            return dict.fromkeys(signatures, code.decode)
 
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: capability)
-        monkeypatch.setattr(cuda_driver, "load_kernels", load)
+        monkeypatch.setattr(kernels, "load_kernels", load)
         kernels._device_kernels.cache_clear()
         return loaded
 

@@ -10,8 +10,8 @@ import pytest
 import geogs
 from geogs.config import LossConfig
 from geogs.depth.confidence import ConfidenceWeights
-from geogs.depth.cuda.fusion import CheckSettings
-from geogs.depth.cuda.grid_completion import CompletionSettings
+from geogs.depth.cuda.classical import CompletionSettings
+from geogs.depth.cuda.revision import CheckSettings
 from geogs.geometry.camera import Camera
 from geogs.losses.cuda.view_table import ViewField
 from geogs.losses.cuda.window_losses import _Flags

@@ -6,10 +6,11 @@ import time
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
-from geogs.io.pictures import decoded, header_of
+from geogs.io.pictures import DEEP, decoded, decoded_bytes, header_of
 from io_samples import empty_png, gradient_image, write_image
 
 
@@ -77,3 +78,13 @@ def test_pipes_and_folders_are_no_pictures(tmp_path):
     for path in (tmp_path / "pipe.png", tmp_path, tmp_path / "none.png"):
         assert decoded(path, cv2.IMREAD_COLOR).picture is None
         assert header_of(path) is None
+
+
+def test_a_tiff_that_is_turned_and_cut_off_is_no_error(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.tif", exif=exif)
+    data = np.fromfile(tmp_path / "a.tif", np.uint8)
+    for flags, shape in ((DEEP, (60, 40)), (DEEP | cv2.IMREAD_IGNORE_ORIENTATION, (40, 60))):
+        assert decoded_bytes(data, flags).picture.shape[:2] == shape
+        assert all(decoded_bytes(data[:n], flags).picture is None for n in range(0, 150, 3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geogs.application.result_settings import RemeshSettings
-from geogs.application.results.remesh import remesh
+from geogs.application.results.revise import remesh
 from geogs.application.results.saved_result import load_result
 from geogs.config import Config
 from geogs.errors import InputError

@@ -9,8 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.keyframe_folder import write_image
 from geogs.mesh.extract import extract_mesh
-from geogs_fleet.join.joined_surface import joint_mesh, plan_space
-from geogs_fleet.join.stored_views import StoredView, equal_runs, loaded
+from geogs_fleet.join.joined_surface import StoredView, equal_runs, joint_mesh, loaded, plan_space
 from one_process import OneProcess
 
 CAMERA = Camera(fx=40.0, fy=40.0, cx=31.5, cy=23.5, width=64, height=48)

@@ -7,7 +7,7 @@ import torch
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_scale
 from geogs.types import Trajectory
 from geogs.world.loops import ImageFeatures
-from geogs_fleet.join.joined_trajectory import joined_trajectory, moved_trajectory, spans_of
+from geogs_fleet.join.joined_files import joined_trajectory, moved_trajectory, spans_of
 from geogs_fleet.join.part import PartViews
 from geogs_fleet.join.part_graph import Placement
 

@@ -11,8 +11,7 @@ from geogs.camera.straight_view import StraightView
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.camera import frame_lenses
-from geogs.loop.camera.found import FrameLenses
-from geogs.loop.camera.frame_lenses import correct_frame_lenses
+from geogs.loop.camera.frame_lenses import FrameLenses, correct_frame_lenses
 from geogs.loop.global_bundle import global_bundle
 from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.scene_mask import SceneMask
@@ -176,7 +175,7 @@ def test_where_matches_tell_nothing_more_what_was_found_stays(monkeypatch):
     ids = list(range(COUNT))
     tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
     each = {n: FrameLens(0.0, 0.001 * n, 0.0) for n in range(COUNT)}
-    before = FrameLenses(each, VaryingPrior((0.0, 0.01, 0.01)))
+    before = FrameLenses(each, VaryingPrior((0.0, 0.01, 0.01, 0.0)))
     monkeypatch.setattr(frame_lenses, "said_of_frame_lenses", lambda *a: [])
     found = correct_frame_lenses(KeyframeMatches(tracker, ids[1:], ids), before)
     assert found
@@ -224,7 +223,7 @@ def test_a_frame_between_keyframes_tells_its_own_lens():
     log.records.append(record)
     zero = torch.zeros(3, dtype=torch.float64)
     known = {k.frame_index: zero for k in keyframes}
-    found = sizes_of_frames(log, keyframes, known, VaryingPrior((1.0, 1.0, 1.0), 1.0))
+    found = sizes_of_frames(log, keyframes, known, VaryingPrior((1.0, 1.0, 1.0, 1.0)))
     np.testing.assert_allclose(found[COUNT], own, atol=2e-3)
     wrong = solved_poses(log, keyframes)[COUNT]
     shift_frames(log, keyframes, {n: FrameLens(*s.tolist()) for n, s in found.items()})

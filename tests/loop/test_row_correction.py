@@ -141,7 +141,7 @@ def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch
         bent.append(error(matches.keyframes.poses(matches.keyframes.ids)))
         return correct_rows(matches, **more)
 
-    monkeypatch.setattr("geogs.loop.camera.adjustment.correct_rows", settle)
+    monkeypatch.setattr("geogs.loop.global_bundle.correct_rows", settle)
     global_bundle(tracker)
     assert bent[0] > 0.05
     assert error(tracker.keyframes.poses(tracker.keyframes.ids)) < 0.4 * bent[0]

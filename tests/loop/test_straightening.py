@@ -8,8 +8,8 @@ from torch import Tensor
 from geogs.camera.shutter.rows import CELL, node_count
 from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.geometry.camera import Camera
-from geogs.loop.camera.straightening import straighten
-from geogs.tracking.frames.straight_rows import straight_rows
+from geogs.loop.global_bundle import straighten
+from geogs.tracking.frames.seen_rows import straight_rows
 from geogs.types import FoundLens, SeenRows
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable

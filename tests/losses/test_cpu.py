@@ -11,7 +11,7 @@ from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import kernel_settings
-from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.cpu.fused import fused_multi_view, fused_single_view
 from geogs.losses.exposure import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView
 from loss_scenes import ALL_TERMS, random_view

@@ -17,7 +17,9 @@ from cuda_emulator import use_emulator
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses.cuda import ViewTable, WindowLosses, window_losses
+from geogs.losses.cuda import window_losses
+from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.cuda.window_losses import WindowLosses
 from geogs.losses.exposure import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import MIN_ALPHA, ViewConstants

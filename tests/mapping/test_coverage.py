@@ -6,11 +6,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from geogs.depth.sweep_neighbors import (
-    BEST_PARALLAX_DEG,
-    MAX_PARALLAX_DEG,
-    MIN_PARALLAX_DEG,
-)
+from geogs.depth.sweep_neighbors import BEST_PARALLAX_DEG, MAX_PARALLAX_DEG, MIN_PARALLAX_DEG
 from geogs.geometry.camera import Camera
 from geogs.mapping.coverage import (
     Sightings,

@@ -7,7 +7,7 @@ from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.loop.camera.straightening import straighten
+from geogs.loop.global_bundle import straighten
 from geogs.mapping.view_arrays import MapCameras
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid

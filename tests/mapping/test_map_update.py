@@ -10,11 +10,13 @@ from geogs.geometry.lie import se3_exp, se3_inverse, sim3_exp, sim3_inverse, sim
 from geogs.mapping.map_update import (
     CovisibleKeyframe,
     Strategy,
+    agreement,
     anchor_transforms,
     apply_each,
+    blended_similarities,
     plan_update,
+    smoothed,
 )
-from geogs.mapping.similarity_field import agreement, blended_similarities, smoothed
 from geogs.types import PoseCorrection
 
 F64 = torch.float64

@@ -9,13 +9,13 @@ import torch
 from geogs.config import LossConfig, PriorConfig
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
-from geogs.losses.cpu import fused_single_view
+from geogs.losses.cpu.fused import fused_single_view
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
 from geogs.priors.monocular_prior import PriorMaps
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph.frame_graph import FrameGraph
-from geogs.tracking.keyframes.monocular_priors import KeyframePriors
+from geogs.tracking.keyframes.segment_map import KeyframePriors
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from keyframe_samples import Sample, segment_of, views_of

@@ -1,6 +1,6 @@
 """Renderings of many keyframes: few in memory, the same as all at once."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from weakref import WeakSet
 
 import numpy as np
@@ -13,13 +13,12 @@ from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views, splat_colours, write_surface
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
-from geogs.mapping.rendered import SurfaceRules, rendered_keyframe
-from geogs.mapping.stored_renders import StoredRender, stored_render
+from geogs.mapping.rendered import SurfaceRules, rendered_keyframe, stored_render
 from geogs.mesh.extract import extract_mesh
 from geogs.on_demand import OnDemand
 from geogs.reconstruction import Reconstruction
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
-from geogs.world.archive import Archive, Archived
+from geogs.world.archive import Archive
 from geogs.world.disks import DiskParameters
 from posed_scene import ball_and_wall
 
@@ -39,11 +38,21 @@ def plane(number: int, distance: float = 2.0) -> RenderedKeyframe:
     return RenderedKeyframe(number, CAMERA, T_cw, depth, normal, weight, image, float(number))
 
 
-def stored(renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
-    """As read from a file."""
+def stored(
+    renders: Sequence[RenderedKeyframe], counts: list[int] | None = None
+) -> Sequence[RenderedKeyframe]:
+    """As read from a file; ``counts`` receives how many depth maps are in memory after each."""
     archive = Archive()
-    kept = [stored_render(r, archive.put(r.image), archive) for r in renders]
-    return OnDemand(kept, StoredRender.load)
+    held: WeakSet[torch.Tensor] = WeakSet()
+
+    def loaded(load: Callable[[], RenderedKeyframe]) -> RenderedKeyframe:
+        render = load()
+        held.add(render.depth)
+        if counts is not None:
+            counts.append(len(held))
+        return render
+
+    return OnDemand([stored_render(r, archive.put(r.image), archive) for r in renders], loaded)
 
 
 def test_elements_are_made_when_they_are_asked_for():
@@ -85,30 +94,13 @@ def test_what_is_stored_comes_back():
         assert back.normal.dtype == torch.float32
 
 
-def count_held(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many depth maps from the file are in memory, after each that is loaded."""
-    held: WeakSet[torch.Tensor] = WeakSet()
-    counts: list[int] = []
-    load = StoredRender.load
-
-    def counted(stored: StoredRender) -> RenderedKeyframe:
-        render = load(stored)
-        if isinstance(stored.depth, Archived):
-            held.add(render.depth)
-            counts.append(len(held))
-        return render
-
-    monkeypatch.setattr(StoredRender, "load", lambda render: counted(render))
-    return counts
-
-
-def test_the_mesh_is_the_same_to_the_last_bit(monkeypatch):
+def test_the_mesh_is_the_same_to_the_last_bit():
     """Of views that come from the file, few of which are in memory at a time."""
     renders = [plane(n) for n in range(20)]
     config = MeshConfig(min_component_faces=10, voxel=0.04, detail=0)
     expected = extract_mesh(fusion_views(renders), config)
-    counts = count_held(monkeypatch)
-    mesh = extract_mesh(fusion_views(stored(renders)), config)
+    counts: list[int] = []
+    mesh = extract_mesh(fusion_views(stored(renders, counts)), config)
     assert len(mesh.faces) > 1000
     for name in ("vertices", "faces", "normals", "colours"):
         assert np.array_equal(getattr(mesh, name), getattr(expected, name))
@@ -116,11 +108,11 @@ def test_the_mesh_is_the_same_to_the_last_bit(monkeypatch):
     assert 3 * 20 <= len(counts) < 10 * 20
 
 
-def test_results_hold_few_maps(monkeypatch, tmp_path):
+def test_results_hold_few_maps(tmp_path):
     """The surface as a file, the colours of disks and the report."""
     renders = [plane(n) for n in range(20)]
-    counts = count_held(monkeypatch)
-    kept = stored(renders)
+    counts: list[int] = []
+    kept = stored(renders, counts)
     config = MeshConfig(min_component_faces=10, voxel=0.04)
     mesh = write_surface(tmp_path / "mesh.ply", kept, config, RunProgress())
     points = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 1.5])
@@ -148,11 +140,9 @@ def test_the_maps_of_a_scene_are_those_of_its_disks(scene):
     mapper = scene.mapper
     renders = scene.renders()
     with torch.no_grad():
-        camera, rules = mapper.cameras.render, SurfaceRules.of(mapper.config)
+        rules = SurfaceRules.of(mapper.config)
         disks = DiskParameters.of(mapper.table.disks.snapshot())
-        eager = [
-            rendered_keyframe(mapper.views[i], disks, camera, rules) for i in mapper.table.mapped
-        ]
+        eager = [rendered_keyframe(mapper.views[i], disks, rules) for i in mapper.table.mapped]
         mapper.table.disks.position.add_(0.1)
     assert len(renders) == len(eager) == len(make_scene().views)
     for now, then in zip(renders, eager, strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.mesh.colour import _SeenImage, add_compiled, add_reference, colour_mesh
+from geogs.mesh.colour import add_compiled, add_reference, colour_mesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 CAMERA = Camera(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -77,13 +77,11 @@ def test_compiled_colours_are_those_of_the_definition():
     image = random.integers(0, 256, (96, 128, 3), np.uint8)
     T = torch.eye(4, dtype=torch.float64)
     T[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
-    seen = _SeenImage.of(
-        DepthMapView(depth, torch.ones_like(depth), CAMERA, T, image), 0.2, normals
-    )
+    seen = DepthMapView(depth, torch.ones_like(depth), CAMERA, T, image)
     found = []
     for add in (add_reference, add_compiled):
         total, weight = torch.zeros(n, 3), torch.zeros(n)
-        add(seen, vertices, normals, total, weight)
+        add(seen, 0.2, vertices, normals, total, weight)
         found.append((total, weight))
     (total, weight), (compiled_total, compiled_weight) = found
     assert int((weight > 0).sum()) > 100

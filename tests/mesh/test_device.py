@@ -8,16 +8,11 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.mesh.clean import border_edges, cleaned, components_on_host, vertex_components
-from geogs.mesh.decimation.deviation import (
-    device_deviations,
-    host_deviations,
-    triangle_distances,
-)
-from geogs.mesh.decimation.deviation_kernels import triangle_distance
+from geogs.mesh.decimation.decimate import device_deviations, host_deviations, triangle_distances
+from geogs.mesh.decimation.decimation_kernels import triangle_distance
 from geogs.mesh.tensor_mesh import TensorMesh
-from geogs.mesh.volume.device_marching import device_surface
 from geogs.mesh.volume.free_space import FreeSpace
-from geogs.mesh.volume.level_set import extract_surface
+from geogs.mesh.volume.level_set import device_surface, extract_surface
 from geogs.mesh.volume.tsdf import SparseTsdf
 from surface_shapes import hills
 
@@ -47,7 +42,7 @@ def volume(device: str = "cpu") -> SparseTsdf:
 def host(tsdf: SparseTsdf) -> SparseTsdf:
     """A copy on the host."""
     copied = SparseTsdf(tsdf.voxel, tsdf.truncation)
-    for name in ("_keys", "_slots", "_coordinates", "_distance", "_weight"):
+    for name in ("_keys", "_slots", "coordinates", "_distance", "_weight"):
         setattr(copied, name, getattr(tsdf, name).cpu())
     return copied
 
@@ -74,7 +69,7 @@ def assert_same_surface(made: TensorMesh, expected: TensorMesh) -> None:
 @DEVICES
 @pytest.mark.parametrize("batch", [5, 100_000])
 def test_the_surface_is_that_of_the_host(device, batch, monkeypatch):
-    monkeypatch.setattr("geogs.mesh.volume.device_marching._BATCH", batch)
+    monkeypatch.setattr("geogs.mesh.volume.level_set._BATCH", batch)
     tsdf = volume(device)
     assert len(tsdf) > 50
     assert_same_surface(device_surface(tsdf, 1.5), extract_surface(host(tsdf), 1.5))

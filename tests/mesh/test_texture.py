@@ -10,11 +10,9 @@ import torch
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.exports.mesh_writers import write_textured_glb
-from geogs.mesh.texture.candidates import find_candidates
-from geogs.mesh.texture.exposure import seam_corrections, view_gains
-from geogs.mesh.texture.labels import face_neighbours
-from geogs.mesh.texture.packing import pack, scale_that_fits
-from geogs.mesh.texture.textured import texture_mesh
+from geogs.mesh.texture.atlas import pack, scale_that_fits
+from geogs.mesh.texture.face_views import face_neighbours, find_candidates
+from geogs.mesh.texture.textured import seam_corrections, texture_mesh, view_gains
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from textured_view import psnr, render_textured
 

@@ -1,6 +1,6 @@
 """Coloured disks in plain PyTorch: every pixel against every disk, for small scenes and tests.
 
-The same image as :mod:`geogs_bench.appearance.gsplat_rasteriser`, whose thresholds are used.
+The same image as :mod:`geogs_bench.appearance.rasteriser`, whose thresholds are used.
 """
 
 from dataclasses import dataclass

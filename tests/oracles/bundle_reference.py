@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import MIN_Z
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import DepthDamping, MeasuredDepths
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 

@@ -9,12 +9,7 @@ from torch import Tensor
 from geogs.bundle.flow_term import BEHIND, weighed_residuals
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import (
-    CellProjection,
-    motion_rows,
-    relative_motion,
-    seen_from_targets,
-)
+from geogs.bundle.projection import CellProjection, motion_rows, relative_motion, seen_from_targets
 from geogs.geometry.robust import huber_cost
 
 
@@ -34,16 +29,16 @@ def linearised(
     """Where cells fall, and the derivatives of that: (e, 9, 2, p) by the motion (left perturbation)
     and the lens, (e, 2, p) by the inverse depths."""
     lens, rays, T_ji = block.lens, block.rays, relative_motion(T_cw, source, target)
-    y, _, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
+    y, _, z = seen_from_targets(rays, T_ji, inverse_depth)
     x, c, q = y[..., :2] / z[..., None], lens, 1 / z
     u, v = x.unbind(-1)
     R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
     tx, ty, tz = t[:, None].unbind(-1)
     # A change of the lens moves the ray by a factor of (x, y, 0).
-    ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
+    ray = (rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
     along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
-    row_x = [*(along_x * slope for slope in rays.slope), (tx - tz * u) * q]
-    row_y = [*(along_y * slope for slope in rays.slope), (ty - tz * v) * q]
+    row_x = [*(along_x * slope for slope in block.slopes), (tx - tz * u) * q]
+    row_y = [*(along_y * slope for slope in block.slopes), (ty - tz * v) * q]
     others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
     J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
     square = u * u + v * v

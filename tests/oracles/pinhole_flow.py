@@ -6,12 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import (
-    SourceFlow,
-    damped_curvature,
-    normal_equations,
-    weighed_residuals,
-)
+from geogs.bundle.flow_term import SourceFlow, damped_curvature, normal_equations, weighed_residuals
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import linearise, project, relative_motion

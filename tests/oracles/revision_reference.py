@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.cuda.photo_vote import offset_and_limit
+from geogs.depth.cuda.revision import offset_and_limit
 from geogs.depth.depth_view import DepthView, relative_poses
-from geogs.depth.revision.far_side import MIN_GAP, as_depth, inverse_planes
 from geogs.depth.revision.photo_vote import CONTRAST, RADIUS
+from geogs.depth.revision.revised_searches import MIN_GAP, as_depth, inverse_planes
 from geogs.geometry.camera import Camera
 
 _AROUND = [step for step in product((-1, 0, 1), repeat=2) if step != (0, 0)]
@@ -104,7 +104,7 @@ def averaged_by_colour(
 
 
 def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
-    """As :func:`geogs.depth.revision.far_side.farther_surface`, all pixels at once."""
+    """As :func:`geogs.depth.revision.revised_searches.farther_surface`, all pixels at once."""
     source = inverse_planes(depth)
     inverse, found = source[0], torch.zeros_like(source)
     (height, width), farthest = depth.shape, inverse.amin()

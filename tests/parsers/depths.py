@@ -20,6 +20,7 @@ def depths() -> dict[str, Parser]:
         "depth-picture": Parser(replica, ("results/depth000000.png",), mutations.binary, all_of),
         "depth-scale": Parser(replica, ("cam_params.json",), mutations.json_text, all_of),
         "depth-list": Parser(tum, ("depth.txt",), mutations.text, all_of),
+        "depth-unit": Parser(tum, ("camera.yaml",), mutations.yaml_text, all_of),
         "stray-camera": Parser(stray, ("camera_matrix.csv",), mutations.text, all_of),
     }
 
@@ -49,6 +50,7 @@ def tum(folder: Path) -> None:
     write_tum(tiny_room(), folder)
     write_depth(folder / "depth/0.png")
     (folder / "depth.txt").write_text("# time file\n0.0 depth/0.png\n0.04 depth/0.png\n")
+    (folder / "camera.yaml").write_text("Camera.fx: 50.0\nRGBD.DepthMapFactor: 1000.0\n")
 
 
 def stray(folder: Path) -> None:

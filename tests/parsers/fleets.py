@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import mutations
-from geogs_fleet.row import FILE, Row, read_row, row_text
 from geogs_fleet.sources import find_sources
 from geogs_fleet.storage import StoragePath
-from geogs_fleet.table import table_html
+from geogs_fleet.table import FILE, Row, read_row, row_text, table_html
 from parsers.base import Parser, written
 
 

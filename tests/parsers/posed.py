@@ -18,6 +18,18 @@ from posed_layouts import (
     write_seven_scenes,
     write_tum,
 )
+from view_lists import (
+    Scene,
+    write_bundler,
+    write_kapture,
+    write_metashape,
+    write_mvsnet,
+    write_nvm,
+    write_openmvg,
+    write_opensfm,
+    write_rc_csv,
+    write_rc_xmp,
+)
 
 
 def posed() -> dict[str, Parser]:
@@ -33,6 +45,13 @@ def posed() -> dict[str, Parser]:
         def both(folder: Path) -> None:
             names = write_room_images(room, folder / "images", "{:d}.png")
             write(room, folder / "sparse" / "0", names)
+
+        return both
+
+    def with_scene(write: Callable[..., object]) -> Callable[[Path], object]:
+        def both(folder: Path) -> None:
+            names = write_room_images(room, folder / "images", "{:d}.png")
+            write(Scene(list(room.T_cw), names), folder)
 
         return both
 
@@ -56,6 +75,19 @@ def posed() -> dict[str, Parser]:
         "scannet": (lambda f: write_scannet(room, f),
                     ("pose/0.txt", "intrinsic/intrinsic_color.txt"), mutations.text),
     }  # fmt: skip
+    lists = {
+        "opensfm": (write_opensfm, "reconstruction.json", mutations.json_text),
+        "metashape": (write_metashape, "cameras.xml", mutations.text),
+        "openmvg": (write_openmvg, "reconstruction/sfm_data.json", mutations.json_text),
+        "realitycapture-csv": (write_rc_csv, "registration.csv", mutations.text),
+        "realitycapture-xmp": (write_rc_xmp, "images/0.xmp", mutations.text),
+        "mvsnet": (write_mvsnet, "cams/00000000_cam.txt", mutations.text),
+        "kapture": (write_kapture, "sensors/sensors.txt", mutations.text),
+        "bundler": (write_bundler, "bundle.out", mutations.text),
+        "visualsfm": (write_nvm, "model.nvm", mutations.text),
+    }
+    for name, (writes, file, damage) in lists.items():
+        layouts[name] = with_scene(writes), (file,), damage
     found = {k: Parser(write, files, damage, use) for k, (write, files, damage) in layouts.items()}
     found["true-poses"] = Parser(
         lambda f: write_tum(room, f), ("groundtruth.txt",), mutations.text,

@@ -25,6 +25,7 @@ def recordings() -> dict[str, Parser]:
     return {
         **{f"images-{s}": images(s) for s in ("jpg", "png", "tif", "bmp", "webp", "ppm")},
         "images-exif": exif(),
+        "images-times": Parser(timed, ("timestamps.csv",), mutations.text, all_of()),
         "video-mp4": video("v.mp4"),
         "video-turned": video("v.mp4", rotation=90),
         "video-mkv": video("v.mkv"),
@@ -47,6 +48,13 @@ def all_of(name: str = "", auto: bool = False) -> Callable[[Path], object]:
     """Reads every frame; with the camera that the source tells of, or one that is given."""
     config = InputConfig() if auto else InputConfig(intrinsics="50,50,31.5,23.5")
     return lambda folder: [f.timestamp for f in open_source(folder / name, config)]
+
+
+def timed(folder: Path) -> None:
+    for i in range(3):
+        write_image(folder / f"{i}.png", gradient_image(i))
+    rows = (f"{i}.png,{i / 10}\n" for i in range(3))
+    (folder / "timestamps.csv").write_text("file,time\n" + "".join(rows))
 
 
 def images(suffix: str) -> Parser:

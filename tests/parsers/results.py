@@ -12,11 +12,11 @@ from geogs.application.evaluate import evaluate
 from geogs.application.export.image_sets import write_colmap_set, write_nerfstudio_set
 from geogs.application.result_settings import EvalSettings
 from geogs.application.results.output_folder import free_folder
-from geogs.application.results.remesh import mesh_settings
 from geogs.application.results.result_page import shown_model, shown_views, write_page_anew
+from geogs.application.results.revise import mesh_settings
 from geogs.application.results.saved_result import load_result
 from geogs.camera.shutter.rows import CELL
-from geogs.evaluation.pages.lengths import lengths
+from geogs.evaluation.pages.run_page import lengths
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.intrinsics_file import write_intrinsics

@@ -20,9 +20,9 @@ from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.slam import Slam
 from geogs.types import Frame
+from geogs_bench.harness import CompletedRun, completed_run, write_completed_run
 from geogs_bench.results.record import Cost, Provenance, Record, read_record, write_json
 from geogs_bench.results.result_folder import ResultFolder
-from geogs_bench.results.store import CompletedRun, completed_run, write_completed_run
 from io_samples import gradient_image
 from parsers.base import Damage, Parser
 from parsers.results import complete

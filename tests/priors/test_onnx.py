@@ -11,9 +11,8 @@ import torch
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.priors.card import PriorCard, card_names, load_card
-from geogs.priors.fitting import fit_image
 from geogs.priors.monocular_prior import DepthKind, MonocularPrior
-from geogs.priors.onnx import OnnxPrior
+from geogs.priors.onnx import OnnxPrior, fit_image
 
 CAMERA = Camera(60.0, 61.0, 31.0, 23.5, 64, 48)
 PLAIN = PriorCard("plain", "here", "none", height=48, width=64, depth_kind="metric")

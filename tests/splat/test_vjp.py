@@ -8,8 +8,7 @@ import torch
 import geogs
 from cuda_emulator import use_emulator
 from geogs.splat.cuda import rasterize
-from geogs.splat.render import Backend, RenderOutput, render
-from geogs.splat.vjp import PullBack, RenderGradients, render_vjp
+from geogs.splat.render import Backend, PullBack, RenderGradients, RenderOutput, render, render_vjp
 from geogs.world.disks import DiskParameters, GaussianMap
 from splat_scenes import CAMERA, MAPS, SCENES, edge_on, ordinary, pose, relative
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from geogs.evaluation.surfaces.raster import render_mesh
-from geogs_bench.scoring.places import places_of
-from geogs_bench.scoring.plane_fits import fit_planes
+from geogs_bench.scoring.depth_scores import fit_planes, places_of
 from geogs_synth.places.dining_room import make_dining_room
+from geogs_synth.scene.textured_scene import scene_mesh
 from geogs_synth.sequence.location import Location, make_location
-from geogs_synth.sequence.scene_mesh import scene_mesh
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,10 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.depth_maps import normals_from_depth
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
-from geogs_synth.raycast.solid_kernels import crossing
-from geogs_synth.raycast.visibility_kernels import visibility_slices
+from geogs_synth.raycast.solid_kernels import BoundedSolids, crossing, visibility_slices
 from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
-from geogs_synth.scene.textured_scene import Scene
+from geogs_synth.scene.textured_scene import Scene, scene_mesh
 from geogs_synth.sequence.location import centred_camera
-from geogs_synth.sequence.scene_mesh import scene_mesh
 from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
@@ -228,20 +226,17 @@ def test_light_reaches_cells_as_if_every_solid_was_asked(room: Scene) -> None:
     """Solids that are left out because they are far from a ray would not have been in its way."""
     s, rng = room.solids, np.random.default_rng(0)
     radius = np.linalg.norm(s.bounding_half, axis=1)
-    solids = s.kind, s.half, s.rotation, s.centre, radius
+    solids = BoundedSolids(s.kind, s.half, s.rotation, s.centre, radius)
     sphere = rng.standard_normal((16, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
     lights = np.array([[*(0.5 * room.size), 0.2], [*(0.2 * room.size), 0.05]])
     voxel, reach = 0.5, 0.7
     nx, ny, nz = np.ceil(room.size / voxel).astype(int)
     volume = np.zeros((nz, ny, nx, 3), np.float32)
-    visibility_slices(*solids, lights, sphere, reach, voxel, 0, nz, volume)
+    visibility_slices(solids, lights, sphere, reach, voxel, 0, nz, volume)
 
     def is_free(p, d, length):
-        return all(
-            crossing(*(a[i] for a in solids), *p, *d, length, False)[0] >= length
-            for i in range(len(radius))
-        )
+        return all(crossing(solids, i, *p, *d, length, False) >= length for i in range(len(radius)))
 
     partly = 0
     for cell in rng.integers(0, (nz, ny, nx), (25, 3)):

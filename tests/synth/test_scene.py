@@ -7,9 +7,9 @@ from geogs.errors import InputError
 from geogs_synth.motion.handheld import FRAMES_PER_LAP
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
-from geogs_synth.scene.textured_scene import Scene
+from geogs_synth.scene.textured_scene import Scene, scene_mesh
 from geogs_synth.sequence.location import centred_camera
-from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
+from geogs_synth.sequence.replica_files import SeenSurface
 from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 

@@ -6,10 +6,10 @@ import torch
 
 from geogs.errors import InputError
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
-from geogs_synth.camera.image_sensor import Sensor
 from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.camera.sensors import ImageSensor
 from geogs_synth.motion.room_motions import room_motion
-from geogs_synth.places.walkers import crossing_walkers
+from geogs_synth.places.moving_bodies import crossing_walkers
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.light_changes import LightChanges, switched_by_thirds
 from geogs_synth.scene.textured_scene import Scene
@@ -147,17 +147,17 @@ def test_without_flaws_the_image_is_the_plain_rendering(raycaster: Raycaster) ->
 def test_light_that_nothing_is_done_to_stays(raycaster: Raycaster) -> None:
     """The sensor alone changes no image by more than rounding."""
     view = _shooting(raycaster, Flaws()).shoot(0).truth
-    image = Sensor(Flaws(), CAMERA).develop((view.shade / 255) ** 2, 0, 0.0)
+    image = ImageSensor(Flaws(), CAMERA).develop((view.shade / 255) ** 2, 0, 0.0)
     assert np.abs(image.astype(int) - view.image).max() <= 1
 
 
 def test_sensor() -> None:
     """Shading, gains and noise of a grey card."""
     card = np.full((72, 96, 3), 0.25, np.float32)
-    shaded = Sensor(Flaws(vignetting=0.5), CAMERA).develop(card, 0, 0.0)
+    shaded = ImageSensor(Flaws(vignetting=0.5), CAMERA).develop(card, 0, 0.0)
     assert shaded[0, 0, 0] == round(255 * np.sqrt(0.125))
     assert shaded[36, 48, 0] in (127, 128)
-    drifting = Sensor(Flaws(gain_drift=0.5, colour_drift=0.1), CAMERA, seed=3)
+    drifting = ImageSensor(Flaws(gain_drift=0.5, colour_drift=0.1), CAMERA, seed=3)
     gains = np.array([drifting.gains(t) for t in np.arange(0, 30, 0.1)])
     assert np.abs(np.log2(gains[:, 1])).max() <= 0.5
     assert np.abs(np.log2(gains[:, 1])).max() > 0.25
@@ -167,12 +167,12 @@ def test_sensor() -> None:
     assert 0.05 < np.abs(balance).max() <= 0.1
     image = drifting.develop(card, 5, 2.0)
     np.testing.assert_allclose(image[0, 0], 127.5 * np.sqrt(drifting.gains(2.0)), atol=0.51)
-    noisy = Sensor(Flaws(noise=4.0), CAMERA)
+    noisy = ImageSensor(Flaws(noise=4.0), CAMERA)
     first, again, other = (noisy.develop(card, k, 0.0).astype(float) for k in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert first.std() == pytest.approx(4, rel=0.05)
     assert (first - other).std() == pytest.approx(4 * np.sqrt(2), rel=0.05)
-    coarse = Sensor(Flaws(noise=4.0, jpeg=10), CAMERA).develop(card, 1, 0.0)
+    coarse = ImageSensor(Flaws(noise=4.0, jpeg=10), CAMERA).develop(card, 1, 0.0)
     assert 0.5 < np.abs(coarse - first).mean() < 8
 
 

@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from geogs.errors import InputError
+from geogs_synth.places.moving_bodies import street_traffic
 from geogs_synth.places.street import DRIVE_METRES, drive, make_street
-from geogs_synth.places.traffic import street_traffic
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
-from geogs_synth.scene.textured_scene import Scene
+from geogs_synth.scene.textured_scene import Scene, scene_mesh
 from geogs_synth.sequence.location import STREET_FOCAL, centred_camera
-from geogs_synth.sequence.replica_files import write_sequence
-from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
+from geogs_synth.sequence.replica_files import SeenSurface, write_sequence
 
 CAMERA = centred_camera(124, 38, STREET_FOCAL)
 

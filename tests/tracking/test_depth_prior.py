@@ -10,12 +10,10 @@ from geogs.bundle.projection import project, relative_motion
 from geogs.config import PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.priors.alignment import align_inverse_depth
-from geogs.priors.monocular_prior import DepthKind
+from geogs.priors.monocular_prior import DepthKind, align_inverse_depth
 from geogs.tracking.depth_prior import (
     DEVIATION,
     FlowEvidence,
-    ScaledPrior,
     adjust_depth,
     depth_scale_step,
     flow_evidence,
@@ -72,17 +70,18 @@ def test_step_equals_the_dense_normal_equations(rows: int, columns: int, step: f
     scale = 2 + 0.2 * torch.rand(3, rows * columns, generator=g)
     alpha = torch.where(prior > 0, 1 / (0.05 * prior) ** 2, 0.0)
     stiffness = node_differences(rows, columns).double() / (step or torch.inf) ** 2
-    moved = depth_scale_step(
-        flow_evidence(grid, p, HUBER), p.inverse_depth, ScaledPrior(prior, scale, alpha),
-        node_weights(grid, rows, columns), stiffness,
-    )  # fmt: skip
+    flow = flow_evidence(grid, p, HUBER)
+    basis = node_weights(grid, rows, columns)
+    depths, scale_steps = depth_scale_step(
+        flow, p.inverse_depth, prior, scale, alpha, basis, stiffness
+    )
     for n in range(3):
         nodes = scale[n].reshape(rows, columns)
         depth, scales = joint_step(grid, p, n, prior[n], nodes, alpha[n], HUBER, step or torch.inf)
         torch.testing.assert_close(
-            moved.scale[n].double(), scales.reshape(-1), rtol=2e-3, atol=1e-4
+            scale_steps[n].double(), scales.reshape(-1), rtol=2e-3, atol=1e-4
         )
-        torch.testing.assert_close(moved.depth[n].double(), depth, rtol=2e-3, atol=5e-5)
+        torch.testing.assert_close(depths[n].double(), depth, rtol=2e-3, atol=5e-5)
         assert float(depth.abs().max()) > 0.02
         assert float(scales.abs().max()) > 0.5
 
@@ -115,10 +114,10 @@ def test_repeated_steps_end_where_the_cost_is_least():
         flow = flow_evidence(grid, problem, huge)
         flow = FlowEvidence(flow.curvature[:1], flow.gradient[:1])
         d = problem.inverse_depth[:1]
-        step = depth_scale_step(flow, d, ScaledPrior(prior[None], scale, alpha[None]), basis, none)
-        scale = scale + step.scale
+        step, scale_step = depth_scale_step(flow, d, prior[None], scale, alpha[None], basis, none)
+        scale = scale + scale_step
         moved = problem.inverse_depth.clone()
-        moved[0] += step.depth[0]
+        moved[0] += step[0]
         problem = replace(problem, inverse_depth=moved)
 
     def cost(depth: torch.Tensor, s: torch.Tensor) -> float:

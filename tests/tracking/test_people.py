@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geogs.config import Config
-from geogs.tracking import track_from_start
+from geogs.tracking import local_mapping
 from geogs.tracking.start import initialise
 from geogs.tracking.tracker import lone_tracker
 from geogs.types import Frame
@@ -60,6 +60,6 @@ def test_without_asking_what_holds_them_together_none_has_its_place(
     monkeypatch: pytest.MonkeyPatch,
 ):
     """None at all, or all, and most a wrong one: what the other test looks at is hard."""
-    for module in (initialise, track_from_start):
+    for module in (initialise, local_mapping):
         monkeypatch.setattr(module, "largest_part", lambda keyframes, *_: frozenset(keyframes.ids))
     assert tracked()[1] > 2

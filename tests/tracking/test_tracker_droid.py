@@ -10,12 +10,8 @@ from geogs.bundle.projection import project
 from geogs.config import Config, TrackingConfig
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.flow.droid import DroidFlow
-from geogs.tracking.flow.droid_network import (
-    DroidNetwork,
-    EdgeOutput,
-    cell_positions,
-    on_cells,
-)
+from geogs.tracking.flow.droid_network import DroidNetwork, EdgeOutput, on_cells
+from geogs.tracking.flow.network_parts import cell_positions
 from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from tracking_runs import error_cm
@@ -40,7 +36,7 @@ class KnowingUpdate:
         source = static[:, 0, 0, 0]
         # The product of both frames' numbers, wherever some cell still looks into the image.
         target = 16 * correlation.flatten(1).amax(1) / source
-        at = cell_positions(ROWS, COLUMNS) + motion[:, :2].permute(0, 2, 3, 1)
+        at = cell_positions(ROWS, COLUMNS, motion) + motion[:, :2].permute(0, 2, 3, 1)
         pairs = zip(source.tolist(), target.tolist(), strict=True)
         truth = torch.stack([self.truth(round(a) - 1, round(b) - 1) for a, b in pairs])
         delta = 0.8 * (truth - at).permute(0, 3, 1, 2)

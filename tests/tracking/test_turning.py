@@ -102,9 +102,7 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
         assert now >= 1.25 * before or attempt is not Attempt.FAR_OFF or now < before
 
 
-def test_the_last_chance_is_taken_with_depths_that_are_more_open(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_the_last_chance_is_taken_with_depths_that_are_more_open(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(start_up, "MAX_DEVIATION", 1e-3)
     path = sideways(12)
     segments, results = run(frames(path))

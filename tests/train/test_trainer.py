@@ -11,12 +11,12 @@ import torch
 from geogs.cli.main import main
 from geogs.geometry.lie import se3_exp
 from geogs.tracking.flow.lookup import CHANNELS, DescriptorPyramid, Edges, PyramidLevel
+from geogs.tracking.flow.network_parts import cell_pixels
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
     FlowFeatures,
     LaplaceMixture,
     NetworkOptions,
-    cell_pixels,
     load_flow_network,
 )
 from geogs_synth.clips.room_options import RoomOptions
@@ -24,7 +24,7 @@ from geogs_train.course import Worker
 from geogs_train.flow.flow_loss import descriptor_loss, flow_loss
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
-from geogs_train.flow.flow_scores import CellErrors, has_texture, summarise
+from geogs_train.flow.flow_validation import CellErrors, has_texture, summarise
 from geogs_train.flow.starts import StartOptions, disturbed_starts
 from geogs_train.launch import course_of
 from geogs_train.network_trainer import NetworkTrainer, schedule

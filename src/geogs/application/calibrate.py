@@ -1,22 +1,25 @@
 """Self-calibration before a run: focal length, shutter and overlay mask, where none was given."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
+import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
-from geogs.camera.shutter.readout import FoundReadout
-from geogs.camera.shutter.shutter import Shutter
+from geogs.camera.shutter.shutter import FoundReadout, Shutter
 from geogs.config import Config
+from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.frame_source import Source
+from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.types import FoundLens
 
 if TYPE_CHECKING:
@@ -27,23 +30,71 @@ Report = Callable[[float], None]
 
 
 def without_overlay(source: Source, progress: RunProgress | None = None) -> Source:
-    """Mask out a static overlay of the source, such as a time stamp, a logo or a bonnet, if no mask
-    was given."""
+    """Mask out the parts of all images that show no scene, if no mask was given: bars and other
+    borders, and static overlays such as a time stamp, a logo or a bonnet.
+
+    Raises:
+        InputError: the images are stereo pairs or panoramas.
+    """
+    if not source.is_overlay_open and source.takes == "none":
+        return source
+    from geogs.io.sources.borders import find_border
+    from geogs.io.sources.static_overlay import IMAGES, LEAST_FRAMES, is_turntable, static_overlay
+
+    images = source.spread(IMAGES)
+    check_pinhole(source, images)
     if not source.is_overlay_open:
         return source
-    from geogs.io.sources.static_overlay import IMAGES, LEAST_FRAMES, static_overlay
+    progress = progress or RunProgress()
+    keep = "--input.no-mask-overlay keeps it."
+    border = find_border(images)
+    if border is not None:
+        size = source.calibration.camera().long_edge
+        progress.write(f"note: {border.sentence(size)} and are masked out. {keep}")
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    is_long = source.length is None or source.length >= LEAST_FRAMES
+    found = static_overlay(grey) if is_long and border is None else None
+    if found is not None:
+        progress.write(
+            f"note: {found.mean():.1%} of each image never changes, as a time stamp or a bonnet, "
+            f"and is masked out. {keep}"
+        )
+    elif is_long and is_turntable(grey):
+        progress.write(
+            "warning: only the middle of the images moves, before a background that stands still, "
+            "as on a turntable: give --mask FOLDER with masks that show the object alone."
+        )
+    mask = border.mask_of(*images[0].shape[:2]) if border is not None else found
+    return source if mask is None else source.without_overlay(mask)
 
-    if source.length is not None and source.length < LEAST_FRAMES:
-        return source
-    images = source.spread(IMAGES)
-    found = static_overlay([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
-    if found is None:
-        return source
-    (progress or RunProgress()).write(
-        f"note: {found.mean():.1%} of each image never changes, as a time stamp or a bonnet, and "
-        "is masked out. --input.no-mask-overlay keeps it."
-    )
-    return source.without_overlay(found)
+
+def warn_of_border(source: PosedSource, progress: RunProgress) -> None:
+    """Say where images with known poses have borders that show no scene."""
+    from geogs.io.sources.borders import find_border
+    from geogs.io.sources.static_overlay import LEAST_IMAGES
+
+    chosen = np.unique(np.linspace(0, len(source) - 1, 2 * LEAST_IMAGES).round().astype(int))
+    try:
+        images = [source[int(index)].image for index in chosen]
+    except InputError:  # which the reading of all will say
+        return
+    if (border := find_border(images)) is not None:
+        progress.write(
+            f"warning: {border.sentence(source.camera.long_edge)}: they become surfaces. Crop the "
+            "images, and move the principal point by as much."
+        )
+
+
+def check_pinhole(source: Source, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> None:
+    """Raise InputError where images spread over a source are stereo pairs or panoramas."""
+    from geogs.io.sources.views import no_pinhole
+
+    found = None if source.takes == "none" else no_pinhole(images)
+    if found is not None:
+        taken = "" if source.takes == "auto" else f"{source.takes}+"
+        raise InputError(
+            f"{source.name} {found.replace('--take ', f'--take {taken}')} (--take none uses all)."
+        )
 
 
 def self_calibrated(
@@ -61,7 +112,9 @@ def self_calibrated(
     request to stop, the guess stays, the shutter counts as global, and ``progress`` reports it.
     Without ``finds_readout`` the shutter stays as it is.
     """
-    config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
+    config = config or Config()
+    progress = progress or RunProgress()
+    stop = stop or Stop()
     asks_lens = config.calibration.refine and source.is_calibration_open
     if source.calibration.is_guess and not asks_lens:
         progress.write(
@@ -132,9 +185,11 @@ def refined(
         from geogs.tracking.calibration.degeneracy import Degeneracy
 
         said = FocalRefinement(
-            keyframes=found.keyframes, frames=found.frames, failure=found.failure,
+            keyframes=found.keyframes,
+            frames=found.frames,
+            failure=found.failure,
             is_explained=found.failure != Degeneracy.UNEXPLAINED.value,
-        )  # fmt: skip
+        )
         origin = f"{calibration.origin}; the video does not tell: {found.failure}"
         return replace(calibration, origin=origin, refinement=said)
     factor = found.camera.fx / working_focal
@@ -151,11 +206,14 @@ def refined(
     said = FocalRefinement(deviation, found.deviations, found.keyframes, found.frames)
     return replace(
         calibration,
-        fx=focal, fy=calibration.fy * factor,
+        fx=focal,
+        fy=calibration.fy * factor,
         distortion=distortion,
         origin=f"{origin} ({calibration.origin} {was})",
-        is_guess=False, is_nominal=False, refinement=said,
-    )  # fmt: skip
+        is_guess=False,
+        is_nominal=False,
+        refinement=said,
+    )
 
 
 def _calibration_sentence(calibration: Calibration, assumed: str) -> str:

@@ -125,7 +125,9 @@ class Driver:
             OutputError: a file cannot be written.
             DeviceError: the memory of the device was full; results so far are written, if any.
         """
-        settings, output, progress = self.settings, self.output, self.progress
+        settings = self.settings
+        output = self.output
+        progress = self.progress
         every = settings.checkpoint_every if work.way_on else 0.0
         checkpoint = Checkpoint(output, every, work.state, progress, work.stopwatch)
 
@@ -136,7 +138,8 @@ class Driver:
             try:
                 with replaced(output, "result") as new:
                     outcome = work.complete(self, checkpoint, new)
-                    finished, scene = outcome is Outcome.FINISHED, work.scene
+                    finished = outcome is Outcome.FINISHED
+                    scene = work.scene
                     self.kernels.wait(progress.stage)
                     can_resume = not finished and checkpoint.is_complete
                     result = Result(scene, work.source, not finished, progress, output, can_resume)

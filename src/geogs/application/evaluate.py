@@ -7,16 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.application.evaluate_surface import (
-    compare_surface,
-    photoconsistency,
-)
+from geogs.application.evaluate_surface import compare_surface, photoconsistency
 from geogs.application.result_settings import EvalSettings
 from geogs.application.results.output_folder import claimed, read_summary
 from geogs.application.results.result_page import shown_model, shown_views
 from geogs.application.results.saved_result import load_result
 from geogs.errors import InputError
-from geogs.evaluation.doubts import doubts
 from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths, ShownModel
 from geogs.evaluation.pages.evaluation_page import SAME_POSES_CM, Evaluation, write_report
 from geogs.evaluation.pages.run_page import PICTURES, figures, run_figures, run_sections
@@ -26,6 +22,7 @@ from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import (
     Alignment,
     TrajectoryErrors,
+    doubts,
     evaluate_trajectory,
 )
 from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
@@ -70,7 +67,8 @@ def _evaluated(settings: EvalSettings, new: Path) -> Evaluation:
             mapped = read_tum_trajectory(settings.output / "keyframes.tum")
             keyframes = _trajectory_errors(settings, mapped, scene, alignment)
     mesh_file, points_file = find_surface(settings) if settings.surface else (None, None)
-    surface, photo = None, None
+    surface = None
+    photo = None
     if (settings.output / "mesh.ply").is_file() and (settings.surface or settings.photo):
         mesh = read_surface(settings.output / "mesh.ply").transformed(trajectory.T_ref_est)
         if settings.surface:
@@ -149,7 +147,8 @@ def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
         if path is not None and not path.is_file():
             raise InputError(f"{path} does not exist; give a PLY file.")
     folder = (settings.gt if settings.gt.is_dir() else settings.gt.parent).resolve()
-    mesh, points = settings.gt_mesh, settings.gt_points
+    mesh = settings.gt_mesh
+    points = settings.gt_points
     for place in (folder, folder.parent):
         names = ["mesh.ply", f"{folder.name}_mesh.ply", "mesh_*.ply", "tsdf_pseudo_gt.ply"]
         found = [path for name in names for path in sorted(place.glob(name))]
@@ -215,7 +214,8 @@ def _model_beside_truth(
         if surface is None:
             return ()
         vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
-        colours, limit = error_colours(vertices, surface), surface.scores.colour_limit_cm
+        colours = error_colours(vertices, surface)
+        limit = surface.scores.colour_limit_cm
         ends = ("0", f"{float(f'{limit:.2g}'):g} cm and more")
         legend = Legend("Distance to the truth", ends, ERROR_STOPS, "grey: not compared")
         return [Colouring("Error", colours, legend)]
@@ -224,5 +224,6 @@ def _model_beside_truth(
     true_path = trajectory.truth[:, :3, 3] @ back[:3, :3].T + back[:3, 3]
     disks = result.disks
     unit = Lengths(trajectory.scale, "Metres, by comparison with the truth.")
-    frames, camera = result.trajectory, result.camera
+    frames = result.trajectory
+    camera = result.camera
     return shown_model(frames, views, camera, mesh, disks, unit, coloured, true_path)

@@ -11,13 +11,9 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import PhotoScores, evaluate_photoconsistency
 from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks, mesh_silhouettes
 from geogs.evaluation.surfaces.surface import Surface, read_surface
-from geogs.evaluation.surfaces.surface_errors import (
-    SurfaceComparison,
-    SurfaceErrors,
-    SurfaceScores,
-)
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison, SurfaceErrors, SurfaceScores
 from geogs.evaluation.surfaces.visibility import Visibility, cull_mesh
-from geogs.evaluation.true_scene import TrueScene, photographs, silhouettes
+from geogs.evaluation.true_scene import TrueScene, silhouettes
 from geogs.geometry.camera import Camera
 from geogs.io.writers.intrinsics_file import read_camera
 
@@ -52,7 +48,7 @@ def compare_surface(
 def photoconsistency(settings: EvalSettings, scene: TrueScene, mesh: Surface) -> PhotoScores:
     """Photo-consistency of every ``photo_every``-th image with others on a mesh in metres."""
     source = scene.images(_PHOTO_EDGE)
-    views = photographs(source)
+    views = list(source)
     held_out = range(settings.photo_every // 2, len(views), settings.photo_every)
     there = Surface(mesh.vertices / scene.metres, mesh.faces)
     return evaluate_photoconsistency(there, source.camera, views, held_out or range(len(views)))
@@ -117,7 +113,8 @@ def _object(
         samples=settings.samples or 4_000_000,
         seed=settings.seed,
     )
-    points_in, distance = errors.reconstruction_points, errors.accuracy
+    points_in = errors.reconstruction_points
+    distance = errors.accuracy
     return SurfaceComparison(errors.scores, mesh, truth, points_in, distance, _REACH)
 
 

@@ -10,8 +10,6 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals to stop: from a terminal, from schedulers, from a closed terminal."""
 _RETRY_SECONDS = 0.02
 """Interval of checks whether modules are still being imported, in seconds."""
-_MAX_IMPORT_SECONDS = 5.0
-"""Seconds after a signal until an import counts as hanging."""
 
 
 def handled_signals() -> list[signal.Signals]:
@@ -31,7 +29,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0)
         raise KeyboardInterrupt
     # The timer's interval, which is never reached, stores the time left for the import.
-    left = max(left - _RETRY_SECONDS, _RETRY_SECONDS) if is_waiting or left else _MAX_IMPORT_SECONDS
+    # After five seconds an import counts as hanging.
+    left = max(left - _RETRY_SECONDS, _RETRY_SECONDS) if is_waiting or left else 5.0
     if number in SIGNALS and left <= _RETRY_SECONDS:
         os._exit(128 + number)
     signal.signal(signal.SIGALRM, interrupt)

@@ -39,9 +39,11 @@ def without_files_outside(settings: S, folder: Path) -> S:
 def with_files_of(settings: S, others: S) -> S:
     """The same settings with the paths of ``others``: for the source, which is checked by its
     fingerprint, and for files of the same name in other folders."""
-    theirs, found = {leaf.path: leaf for leaf in _naming(others)}, dict[tuple[str, ...], object]()
+    theirs = {leaf.path: leaf for leaf in _naming(others)}
+    found = dict[tuple[str, ...], object]()
     for leaf in _naming(settings):
-        other, is_source = theirs.get(leaf.path), leaf.mark(Positional) is not None
+        other = theirs.get(leaf.path)
+        is_source = leaf.mark(Positional) is not None
         if other is not None and (is_source or _last(leaf) == _last(other)):
             found[leaf.path] = other.default
     return with_values(settings, found)

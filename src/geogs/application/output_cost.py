@@ -105,7 +105,8 @@ class OutputForecast:
 
     def settled(self) -> OutputCost:
         """Final estimate, by the surface of all checked depths."""
-        scene, found = self._scene, self._found
+        scene = self._scene
+        found = self._found
         assert found is not None, "rehearsed before"
         try:
             whole = plan_volume(fusion_views(scene.depth_maps()), scene.config.mesh)
@@ -116,7 +117,8 @@ class OutputForecast:
 
     def _affordable_triangles(self, found: _Rehearsal, times: float) -> float:
         """Fraction of the triangles for which there is time; sets the scene's triangle budget."""
-        scene, mesh = self._scene, self._scene.config.mesh
+        scene = self._scene
+        mesh = self._scene.config.mesh
         surface = CAUTION * COARSER**2 * times * found.surface
         spare = MAX_MESH_TIME * scene.budget.left - CAUTION * found.report
         if mesh.voxel is not None or surface <= max(spare, 0.0):
@@ -130,7 +132,8 @@ class OutputForecast:
 
 def _neighbouring(scene: Reconstruction) -> list[int]:
     """Ids of neighbouring mapped keyframes."""
-    mapped, views = scene.table.map.mapped, scene.mapper.views
+    mapped = scene.table.map.mapped
+    views = scene.mapper.views
     return [view.id for view in views.near(views[mapped[0]], mapped, VIEWS)]
 
 
@@ -139,21 +142,28 @@ def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
     a_view = CAUTION * found.a_view
     _log.info(
         "mesh and files: %.1f s, %.1f times those of the rehearsal, and %.3f s an image",
-        once, times_the_surface, a_view,
-    )  # fmt: skip
+        once,
+        times_the_surface,
+        a_view,
+    )
     return OutputCost(once, a_view)
 
 
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehearsal:
-    start, mesh, blocks, triangles = clock(), None, 0, 0
+    start = clock()
+    mesh = None
+    blocks = 0
+    triangles = 0
     config = replace(scene.config.mesh, min_weight=min(scene.config.mesh.min_weight, ONE_VIEW))
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
         renders = scene.depth_maps(of=views)
         write_keyframes(Path(folder), scene, scene.camera, renders, True)
-        of_views, times = clock() - start, MeshTimes(clock)
+        of_views = clock() - start
+        times = MeshTimes(clock)
         try:
             plan = plan_volume(fusion_views(renders), scene.config.mesh)
-            blocks, triangles = plan.blocks, plan.triangles
+            blocks = plan.blocks
+            triangles = plan.triangles
             coarse = replace(config, voxel=COARSER * plan.voxel)
             mesh = extract_mesh(fusion_views(renders), coarse, times)
         except InputError:  # these views show no surface; others may

@@ -25,9 +25,6 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress
 from geogs.types import Trajectory
 
-# Largest number of scene points for the typical depth of each image.
-_MAX_DEPTH_POINTS = 4000
-
 
 class PosedViews:
     """Gives a reconstruction the images of a source, the most informative first.
@@ -73,15 +70,19 @@ class PosedViews:
         poses = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
         with self._scene.stopwatch("first look"):
             return first_points(
-                poses, image_at, source.camera,
+                poses,
+                image_at,
+                source.camera,
                 lambda fraction: self._report("first look", fraction),
-            )  # fmt: skip
+            )
 
     def choose(self, points: Float64[np.ndarray, "n 3"]) -> None:
         """Order the images such that each prefix covers the scene well."""
         with self._scene.stopwatch("choosing views"):
-            source, config = self._source, self._scene.config
-            typical, random = usual_depths(source, points), np.random.default_rng(config.seed)
+            source = self._source
+            config = self._scene.config
+            typical = usual_depths(source, points)
+            random = np.random.default_rng(config.seed)
             shown = scene_points(source.T_cw, source.camera, typical, random)
             self._seen = sightings(source.T_cw, source.camera, typical, shown)
             usual = float(np.median(typical))
@@ -101,7 +102,8 @@ class PosedViews:
 
     def give_these(self, indices: Sequence[int]) -> None:
         """Add the images with these indices to the scene, in this order."""
-        source, scene = self._source, self._scene
+        source = self._source
+        scene = self._scene
         for done, image in enumerate(read_side_by_side(source.__getitem__, indices)):
             scene.add(image.image, image.T_cw, image.mask, image.timestamp, image.index)
             self._report("reading", (done + 1) / len(indices))
@@ -119,6 +121,7 @@ def usual_depths(
     source: PosedSource, points: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "v"]:
     """Median depth of the points that each image sees."""
-    some = points[:: 1 + len(points) // _MAX_DEPTH_POINTS]
+    # Largest number of scene points for the typical depth of each image.
+    some = points[:: 1 + len(points) // 4000]
     poses = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
     return np.array([depth_search(pose, some, source.camera, 1.0).typical for pose in poses])

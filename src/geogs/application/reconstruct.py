@@ -1,16 +1,19 @@
 """A reconstruction from known poses, from the path of the images to the result."""
 
+import hashlib
+import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import torch
 
-from geogs.application.checkpoints.checkpoint import Checkpoint
-from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
+from geogs.application.calibrate import warn_of_border
+from geogs.application.checkpoints.checkpoint import Checkpoint, SavedState
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
@@ -28,17 +31,12 @@ from geogs.config.idle import idle_settings
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
+from geogs.io.sources.posed.pose_check import PoseCheck, check_poses, with_focal_length
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
 from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
-
-FIRST_BATCH = 24
-"""Number of images read first; they show the cost per image, and so how many are affordable."""
-_MIN_BUDGET = 1.0
-"""Least seconds left of a budget, even if reading and checking have used it up."""
 
 
 def left_of(budget: float | None, begin: float) -> float | None:
@@ -46,7 +44,8 @@ def left_of(budget: float | None, begin: float) -> float | None:
     there is no limit."""
     if budget is None:
         return None
-    return max(budget - (time.perf_counter() - begin), _MIN_BUDGET)
+    # Least seconds left of a budget, even if reading and checking have used it up.
+    return max(budget - (time.perf_counter() - begin), 1.0)
 
 
 def _compiled(
@@ -87,7 +86,8 @@ def reconstruct(
         DeviceError: the device cannot be used, or its memory is full.
     """
     begin = time.perf_counter()
-    config, progress = config or ReconstructConfig(), progress or RunProgress()
+    config = config or ReconstructConfig()
+    progress = progress or RunProgress()
     used = require_device(device)
     with compiling(used, knows_poses=True) as kernels:
         if not isinstance(source, PosedSource):
@@ -98,6 +98,7 @@ def reconstruct(
                     )
             else:
                 source = open_posed_source(source, config.input)
+        source = with_focal_length(source)
         begin += _compiled(used, kernels, budget, progress)
     checks = progress if check and poses == "given" else None
     with gpu_errors_in_a_sentence():
@@ -109,9 +110,7 @@ def reconstruct(
 @on_one_torch_thread
 @gpu_errors_in_a_sentence()
 def reconstruct_to_folder(
-    settings: ReconstructSettings,
-    progress: RunProgress | None = None,
-    stop: Stop | None = None,
+    settings: ReconstructSettings, progress: RunProgress | None = None, stop: Stop | None = None
 ) -> Result:
     """Reconstruct, and write the results, with checkpoints and snapshots on the way.
 
@@ -122,8 +121,10 @@ def reconstruct_to_folder(
         DeviceError: the device cannot be used, or its memory is full.
     """
     begin = time.perf_counter()
-    progress, stop = progress or RunProgress(), stop or Stop()
-    config, device = settings.config, require_device(settings.device)
+    progress = progress or RunProgress()
+    stop = stop or Stop()
+    config = settings.config
+    device = require_device(settings.device)
     for sentence in idle_settings(config):
         progress.write(f"note: {sentence}")
     finds_poses = settings.poses == "auto"
@@ -142,14 +143,54 @@ def reconstruct_to_folder(
         if finds_poses:
             with stop:
                 source = open_photographs(
-                    settings.source, config, output, settings.hold_out, settings.resume, progress,
-                    stop, settings.budget,
-                )  # fmt: skip
+                    settings.source,
+                    config,
+                    output,
+                    settings.hold_out,
+                    settings.resume,
+                    progress,
+                    stop,
+                    settings.budget,
+                )
+        source = with_focal_length(source)
+        for line in source.account.lines(source.found):
+            progress.write(line)
+        warn_of_border(source, progress)
         begin += _compiled(device, kernels, settings.budget, progress)
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)
         return driver.complete(MappedImages(scene, source, settings))
+
+
+@dataclass(frozen=True)
+class ReconstructState:
+    """Checkpoint record of ``geogs reconstruct``."""
+
+    made_from: str
+    """Fingerprint of settings and images."""
+    work: ReconstructionTable
+
+
+def fingerprint(config: ReconstructConfig, hold_out: int | None, images: Sequence[str]) -> str:
+    """Sixteen digits that depend on the settings of the map and the names of its images."""
+    parts = (config.seed, asdict(config.input), asdict(config.search), asdict(config.mapping))
+    text = json.dumps([*parts, hold_out, list(images)], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def read_work(output: Path, made_from: str) -> ReconstructionTable:
+    """Read the work of a checkpoint with the same fingerprint.
+
+    Raises:
+        InputError: there is nothing, it is damaged, or made from other settings or images.
+    """
+    saved = SavedState(output, ReconstructState)
+    with saved.in_a_sentence():
+        if saved.plain("made_from") != made_from:
+            raise InputError("it was made with other settings or images; give the same ones")
+    work: ReconstructionTable = saved.work("work")
+    return work
 
 
 class MappedImages(Work):
@@ -187,7 +228,9 @@ class MappedImages(Work):
             InputError: there is nothing to resume, or the images show no scene.
             KeyboardInterrupt: it was stopped before there was a map.
         """
-        settings, scene, progress = self._settings, self.scene, driver.progress
+        settings = self._settings
+        scene = self.scene
+        progress = driver.progress
         resumed = None
         if settings.resume:
             resumed = read_work(driver.output, self._made_from)
@@ -214,10 +257,14 @@ class MappedImages(Work):
         return driver.map_known(scene, work, checkpoint)
 
 
-def _say_whether_poses_fit(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
+def _say_whether_poses_fit(
+    source: PosedSource, progress: RunProgress | None, checked: Future[PoseCheck] | None
+) -> None:
     """Warn if the poses do not fit the images. Raises InputError if they clearly do not."""
     if progress is not None and checked is not None:
-        warning = checked.result().warning
+        check = checked.result()
+        source.pose_error = check.numbers
+        warning = check.warning
         progress.write(f"warning: {warning}" if warning else "")
 
 
@@ -244,9 +291,9 @@ def _complete(
             points = views.first_look()
         except InputError:
             # An error on the pose convention is more helpful than one on missing matches.
-            _say_whether_poses_fit(checks, checked)
+            _say_whether_poses_fit(source, checks, checked)
             raise
-        _say_whether_poses_fit(checks, checked)
+        _say_whether_poses_fit(source, checks, checked)
     views.choose(points)
     if not budgeted:
         views.give()
@@ -264,7 +311,8 @@ def _complete(
         if stage == "growing":
             scene.budget.output_cost = forecast.settled()
 
-    views.give(FIRST_BATCH)
+    # Number of images read first; they show the cost per image, and so how many are affordable.
+    views.give(24)
     scene.finish(points, reported, more)
 
 

@@ -22,10 +22,7 @@ WITHOUT_STABILISATION = (
 
 
 def remedy(
-    settings: RunSettings,
-    source: Source | PosedSource,
-    judged: Verdict | None,
-    took: float = 0.0,
+    settings: RunSettings, source: Source | PosedSource, judged: Verdict | None, took: float = 0.0
 ) -> str:
     """A sentence with the command that most likely helps, and the time it takes.
 
@@ -57,9 +54,11 @@ def remedy(
 def arguments(settings: RunSettings) -> str:
     """Sources and main options, as arguments of ``geogs run``."""
     words = [str(path) for path in settings.source]
-    name, given, usual = preset_of(settings.config), settings.config.input, InputConfig()
+    name = preset_of(settings.config)
+    given = settings.config.input
+    usual = InputConfig()
     words += [] if name == "default" else ["--preset", name]
-    for option in ("intrinsics", "start", "stop", "stride"):
+    for option in ("intrinsics", "take", "start", "stop", "stride"):
         if (value := getattr(given, option)) != getattr(usual, option):
             words += [f"--{option}", str(value)]
     return shlex.join(words)

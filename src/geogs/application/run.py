@@ -8,7 +8,7 @@ from pathlib import Path
 from geogs.application.calibrate import self_calibrated, without_overlay
 from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
-from geogs.application.driver import Driver
+from geogs.application.driver import Driver, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
@@ -21,18 +21,17 @@ from geogs.application.results.result import Result
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
-from geogs.application.slam_in_python import go_on_in
+from geogs.application.slam_in_python import go_on_in, new_slam
 from geogs.application.structure_from_motion.fallback import TrackedOrPlaced
 from geogs.application.tracked_video import TrackedVideo
 from geogs.application.viewer.observer import RunObserver
-from geogs.config import Config, InputConfig
+from geogs.config import Config
 from geogs.config.idle import idle_settings
 from geogs.errors import InputError, TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.address import live_address
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
-from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import operator_found
 
@@ -58,22 +57,14 @@ def run(
         DeviceError: the device cannot be used, or its memory was full; results so far are written.
         KeyboardInterrupt: it was stopped before there was anything to keep, or twice.
     """
-    progress, stop = progress or RunProgress(), stop or Stop()
-    config, device = settings.config, require_device(settings.device)
-    scale = scale_source(settings.scale_from)
-    if settings.offline and (scale is not None or config.input.depth != "none"):
-        raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
-    defers = maps_at_the_end(settings, observer)
-    for sentence in () if settings.offline else idle_settings(config, defers, _is_live(settings)):
-        progress.write(f"note: {sentence}")
-    if (operator := operator_found(config.tracking)) is not None:
-        progress.write(f"note: {operator}")
+    progress = progress or RunProgress()
+    stop = stop or Stop()
+    device = require_device(settings.device)
+    defers_map = maps_at_the_end(settings, observer)
+    _report_settings(settings, defers_map, progress)
     base = None if settings.map is None else load_result(settings.map, device)
     opened = opened_for(settings, base)
-    for sentence in opened.depths_found if config.input.depth == "auto" else ():
-        progress.write(f"note: {sentence}")
-    if isinstance(scale, SensorScale) and not opened.uses_depth:
-        raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
+    _check_input(settings, opened, progress)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
@@ -83,32 +74,82 @@ def run(
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
         opened = without_overlay(opened, progress)
         if settings.offline:
-            from geogs.application.structure_from_motion.offline import (
-                MIN_READOUT_FPS,
-                PlacedOffline,
-                beginning_with,
-            )
+            return driver.complete(_offline(settings.config, driver, opened))
+        source = self_calibrated(opened, settings.config, device, progress, stop)
+        prior = open_prior(settings.config.prior, source.camera, device)
+        slam = new_slam(source, settings.config, device, prior, defers_map)
+        if base is not None:
+            go_on_in(slam, base)
+        metadata = _metadata(settings, driver, opened, source)
+        tracked = TrackedVideo(slam, source, iter(source), metadata, output)
+        return _completed(driver, settings, TrackedOrPlaced(tracked, opened))
 
-            finds_readout = opened.recorded_fps >= MIN_READOUT_FPS
-            found = self_calibrated(opened, config, device, progress, stop, finds_readout)
-            return driver.complete(PlacedOffline(config, beginning_with(opened, found)))
-        work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened)
-        return _completed(driver, settings, work)
+
+def _report_settings(settings: RunSettings, defers_map: bool, progress: RunProgress) -> None:
+    """Name settings that do nothing. Raises InputError for those that exclude each other."""
+    config = settings.config
+    knows_metres = scale_source(settings.scale_from) is not None or config.input.depth != "none"
+    if settings.offline and knows_metres:
+        raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
+    if not settings.offline:
+        for sentence in idle_settings(config, defers_map, _is_live(settings)):
+            progress.write(f"note: {sentence}")
+    if (operator := operator_found(config.tracking)) is not None:
+        progress.write(f"note: {operator}")
+
+
+def _check_input(settings: RunSettings, opened: Source, progress: RunProgress) -> None:
+    """Report the account of the input. Raises InputError if needed depths are missing."""
+    for line in opened.account.lines(opened.found):
+        progress.write(line)
+    if isinstance(scale_source(settings.scale_from), SensorScale) and not opened.uses_depth:
+        raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
+
+
+def _offline(config: Config, driver: Driver, opened: Source) -> Work:
+    """The work of structure from motion, from a calibrated start."""
+    from geogs.application.structure_from_motion.offline import (
+        MIN_READOUT_FPS,
+        PlacedOffline,
+        beginning_with,
+    )
+
+    finds_readout = opened.recorded_fps >= MIN_READOUT_FPS
+    found = self_calibrated(
+        opened, config, driver.device, driver.progress, driver.stop, finds_readout
+    )
+    return PlacedOffline(config, beginning_with(opened, found))
+
+
+def _metadata(settings: RunSettings, driver: Driver, opened: Source, source: Source) -> RunMetadata:
+    """Metadata of a run for its checkpoints; writes a note if the folder already has one."""
+    if has_checkpoint(driver.output):
+        driver.progress.write(
+            f"Starting anew. geogs run --resume {driver.output} continues the unfinished run "
+            "there, until this one writes a checkpoint."
+        )
+    found = None if source.calibration is opened.calibration else source.calibration
+    return RunMetadata(
+        settings.absolute(), driver.device.type, source.fingerprint(), found, shutter=source.shutter
+    )
 
 
 def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
     """Open the sources; to continue a map with an estimated lens, in its keyframes' pinhole."""
-    config = settings.config
-    if base is None:
-        return open_source(settings.source, config.input)
-    seen = seen_by(base, config)
-    opened, focal = open_source(settings.source, seen), base.camera.fx
-    is_same = seen is config.input or math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
-    return opened if is_same or seen.field_of_view != "auto" else opened.with_focal(focal)
+    given = settings.config.input
+    if base is None or given.intrinsics.strip().lower() != "auto":
+        return open_source(settings.source, given)
+    known = base.folder / "intrinsics.json"
+    if not known.is_file():
+        return open_source(settings.source, given)
+    opened = open_source(settings.source, replace(given, intrinsics=str(known)))
+    focal = base.camera.fx
+    is_same = math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
+    return opened if is_same or given.field_of_view != "auto" else opened.with_focal(focal)
 
 
 def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Result:
-    """Do the work. Raises TrackingLost, with a remedy, if no frame could be tracked or located."""
+    """Track, map, write. Raises TrackingLost, with a remedy, if no frame could be located."""
     try:
         return driver.complete(work)
     except TrackingLost as lost:
@@ -128,40 +169,6 @@ def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool
         return False
     is_shown = observer is not None or settings.online_results or settings.map is not None
     return mapping.when == "after" or not is_shown
-
-
-def seen_by(base: SavedResult, config: Config) -> InputConfig:
-    """Input settings with the intrinsics of an earlier result, unless others are given."""
-    known = base.folder / "intrinsics.json"
-    if config.input.intrinsics.strip().lower() != "auto" or not known.is_file():
-        return config.input
-    return replace(config.input, intrinsics=str(known))
-
-
-def _begun(
-    settings: RunSettings, driver: Driver, opened: Source, base: SavedResult | None
-) -> TrackedVideo:
-    """Make a system for an opened source, calibrated; in the map of ``base`` if given."""
-    config, progress, stop = settings.config, driver.progress, driver.stop
-    source = self_calibrated(opened, config, driver.device, progress, stop)
-    prior = open_prior(config.prior, source.camera, driver.device)
-    slam = Slam(
-        source.camera, config, str(driver.device), prior, source.is_live, source.mask,
-        source.black_is_masked, maps_at_the_end(settings, driver.observer),
-        focal_deviation=source.calibration.focal_deviation,
-    )  # fmt: skip
-    if base is not None:
-        go_on_in(slam, base)
-    found = None if source.calibration is opened.calibration else source.calibration
-    metadata = RunMetadata(
-        settings.absolute(), driver.device.type, source.fingerprint(), found, shutter=source.shutter
-    )
-    if has_checkpoint(driver.output):
-        progress.write(
-            f"Starting anew. geogs run --resume {driver.output} continues the unfinished run "
-            "there, until this one writes a checkpoint."
-        )
-    return TrackedVideo(slam, source, iter(source), metadata, driver.output)
 
 
 @on_one_torch_thread
@@ -184,21 +191,18 @@ def resume(
         InputError: there is nothing to resume, or it cannot be used, or with other settings.
         TrackingLost, OutputError, DeviceError: as for ``run``.
     """
-    progress, stop = progress or RunProgress(), stop or Stop()
+    progress = progress or RunProgress()
+    stop = stop or Stop()
     saved = SavedRun(output)
     settings = continued(saved.metadata, settings or saved.settings, output)
-    config, device = settings.config, require_device(settings.device)
-    opened = without_overlay(open_source(settings.source, config.input))
+    device = require_device(settings.device)
+    opened = without_overlay(open_source(settings.source, settings.config.input))
     source = saved.calibrated(opened)
     with claimed(output) as folder, compiling(device) as kernels:
         compile_gpu_kernels(device)
-        prior = open_prior(config.prior, source.camera, device)
+        prior = open_prior(settings.config.prior, source.camera, device)
         with saved.world(device) as world:
-            slam = Slam(
-                source.camera, config, str(device), prior, mask=source.mask,
-                black_is_masked=source.black_is_masked, world=world,
-                focal_deviation=source.calibration.focal_deviation,
-            )  # fmt: skip
+            slam = new_slam(source, settings.config, device, prior, world=world)
         progress.write(f"Continuing after {slam.frames} frames.")
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = source.frames_after(saved.metadata.place)

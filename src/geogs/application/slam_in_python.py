@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool
 
 from geogs.application.calibrate import self_calibrated
@@ -25,9 +26,11 @@ from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.pose_estimate import PoseEstimate
+from geogs.priors.monocular_prior import MonocularPrior
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.keyframes.saved_keyframes import add_saved_keyframes
+from geogs.tracking.keyframes.segment_map import add_saved_keyframes
+from geogs.world.world import World
 
 
 def track(
@@ -56,12 +59,32 @@ def track(
     if slam is None:
         if stream is not source:
             stream = self_calibrated(stream, settings, require_device(device))
-        slam = Slam(
-            stream.camera, settings, device, None, stream.is_live, stream.mask,
-            stream.black_is_masked, focal_deviation=stream.calibration.focal_deviation,
-        )  # fmt: skip
+        slam = new_slam(stream, settings, require_device(device))
     for frame in stream:
         yield slam.process(frame)
+
+
+def new_slam(
+    source: Source,
+    config: Config,
+    device: torch.device,
+    prior: MonocularPrior | None = None,
+    defers_map: bool = False,
+    world: World | None = None,
+) -> Slam:
+    """Make a system for the frames of a source, or continue with the ``world`` of another."""
+    return Slam(
+        source.camera,
+        config,
+        str(device),
+        prior,
+        source.is_live,
+        source.mask,
+        source.black_is_masked,
+        defers_map,
+        world,
+        source.calibration.focal_deviation,
+    )
 
 
 @on_one_torch_thread
@@ -121,7 +144,8 @@ def save_slam(slam: Slam, folder: str | Path) -> Path:
     renders = slam.renders()
     if not len(renders):
         raise InputError("There is no map to save yet; no keyframe has been mapped.")
-    trajectory, known = slam.trajectory(), slam.uncertainty()
+    trajectory = slam.trajectory()
+    known = slam.uncertainty()
     with claimed(Path(folder)) as output, replaced(output, "result") as new:
         write_trajectories(new, trajectory, slam.keyframe_trajectory())
         if known is not None:

@@ -14,8 +14,7 @@ from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
 from geogs.application.results.surfaces import write_stage
-from geogs.application.scale.apply import make_metric
-from geogs.application.scale.known_length import scale_source
+from geogs.application.scale.known_length import make_metric, scale_source
 from geogs.io.sources.frame_source import Source
 from geogs.mapping.mapper import SEARCHED
 from geogs.slam import Slam
@@ -24,8 +23,6 @@ from geogs.types import Frame
 
 MIN_PREVIEW_KEYFRAMES = 20
 """Least number of keyframes for a preview: map and mesh take long on a CPU then."""
-INTERRUPTED_SECONDS = 40.0
-"""Time in seconds for a map after an interruption, where there is none yet."""
 
 
 @dataclass
@@ -57,7 +54,9 @@ class TrackedVideo:
 
         Raises TrackingLost if no frame could be tracked.
         """
-        slam, source, progress = self.scene, self.source, driver.progress
+        slam = self.scene
+        source = self.source
+        progress = driver.progress
         if not slam.world.maps_at_end:
             driver.kernels.wait(progress.stage)
         progress.expect(source.length)
@@ -74,12 +73,13 @@ class TrackedVideo:
     def map(self, driver: Driver, outcome: Outcome) -> Outcome:
         """Make the map after :meth:`locate` ended with ``outcome``; if either is interrupted, a map
         in little time."""
-        slam, was_cut = self.scene, outcome is not Outcome.FINISHED
+        slam = self.scene
+        was_cut = outcome is not Outcome.FINISHED
         if outcome is Outcome.FINISHED and slam.world.maps_at_end and not driver.kernels.is_working:
             self._write_preview(driver)
         outcome = _finished(driver, outcome, lambda: self._refine(driver))
         if was_cut or outcome is Outcome.STOPPED:
-            briefly = partial(slam.refine, driver.progress.stage, INTERRUPTED_SECONDS)
+            briefly = partial(slam.refine, driver.progress.stage, seconds=40.0)
             _finished(driver, Outcome.FINISHED, briefly)
         scale = scale_source(self.metadata.settings.scale_from)
         make_metric(slam, self.source, scale, driver.progress)
@@ -106,7 +106,8 @@ class TrackedVideo:
         return Outcome.STOPPED
 
     def _track_each(self, driver: Driver, checkpoint: Checkpoint) -> None:
-        slam, dropped = self.scene, 0
+        slam = self.scene
+        dropped = 0
         for frame in _timed(self.frames, slam.stopwatch):
             if self.source.dropped > dropped:
                 dropped = self.source.dropped
@@ -137,19 +138,20 @@ class TrackedVideo:
         is_short = len(slam.segments.main.segment.ids) < MIN_PREVIEW_KEYFRAMES
         if is_short or slam.world.keyframes.grid.on_gpu:  # there the map is made in seconds
             return
-        from geogs.application.results.preview import NAME, write_preview
+        from geogs.application.results.surfaces import PREVIEW, write_preview
 
         with slam.stopwatch("preview"):
             is_there = write_preview(driver.output, slam)
         if is_there:
             driver.progress.write(
-                f"A first, rough mesh is in {driver.output / NAME}, until the other one is made."
+                f"A first, rough mesh is in {driver.output / PREVIEW}, until the other one is made."
             )
 
     def _adjust(self, driver: Driver, new: Path) -> None:
         self.scene.adjust(driver.report)
         if (lens := self.scene.lens) is not None:
-            before, self.source = self.source, self.source.with_lens(lens)
+            before = self.source
+            self.source = self.source.with_lens(lens)
             driver.progress.write(lens_sentence(before.calibration, lens, self.source.calibration))
         if self.scene.will_refine:
             self._write_stage("adjusted", driver, new)

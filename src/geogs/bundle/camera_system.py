@@ -42,7 +42,9 @@ class DenseCameraSystem:
 
         The diagonal D is raised by ``damping`` |D| + ``floor``.
         """
-        H, g, free = self.hessian, self.gradient, self.free
+        H = self.hessian
+        g = self.gradient
+        free = self.free
         step = torch.zeros_like(g)
         if not len(free):
             return step
@@ -152,7 +154,8 @@ class SparseCameraSystem:
         xi = torch.zeros(len(self._free), 6, dtype=torch.float64)
         if not self._count:
             return xi.reshape(-1)
-        n, width = 6 * self._count, 6 * (self.bandwidth + 1)
+        n = 6 * self._count
+        width = 6 * (self.bandwidth + 1)
         band = np.zeros((width, n), order="F")
         within = np.arange(6)
         for begin in range(0, len(self._keys), 4096):

@@ -12,13 +12,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.camera_system import DenseCameraSystem
-from geogs.bundle.flow_term import FlowTerm, SourceFlow, linearised_sources
+from geogs.bundle.flow_term import SourceFlow, linearised_sources
 from geogs.bundle.lens_flow import LensFlow
-from geogs.bundle.problem import BundleProblem, source_chunks
+from geogs.bundle.problem import BundleProblem
 from geogs.bundle.protocols import BundleOptions, BundleResult
-from geogs.bundle.schur import SchurBundle
+from geogs.bundle.schur import FlowSchur
 from geogs.bundle.terms import BundleState
-from geogs.threads import thread_map
 from geogs.world.grid import SampleGrid
 
 FLOOR = 1e-2
@@ -44,41 +43,27 @@ class LinearBundle:
     """Sources, with all terms of their depths."""
 
 
-class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
+class DenseSchur(FlowSchur[BundleProblem, LinearBundle]):
     """One adjustment that keeps all linearised edges."""
 
     floor = FLOOR
 
-    def __init__(self, problem: BundleProblem, flow: FlowTerm, options: BundleOptions) -> None:
-        super().__init__(problem, options)
-        self.flow = flow
-
     def linearise(self, state: BundleState) -> LinearBundle:
-        """Linearise chunks of edges in parallel, always summed in the same order."""
-        problem, options = self.problem, self.options
-        chunks = source_chunks(problem.source, options.chunk)
+        """Linearise all edges, always summed in the same order."""
+        problem = self.problem
 
-        def work(chunk: slice) -> list[SourceFlow]:
-            return linearised_sources(self.flow, problem.part(chunk), state, options)
+        def work(part: BundleProblem) -> list[SourceFlow]:
+            return linearised_sources(self.flow, part, state, self.options)
 
-        sources = [source for part in thread_map(work, chunks) for source in part]
+        sources = [source for found in self.by_parts(work) for source in found]
         free_shared = () if state.block is None else state.block.free
         system = DenseCameraSystem(problem.free_pose, free_shared)
         system.add(source.edges for source in sources)
         for term in problem.pose_terms:
             system.add(term.hyper_edges(state))
         for source in sources:
-            self.information[source.frame] = source.information
+            self.information[source.frame] = source.edges.depth.information
         return LinearBundle(system, sources)
-
-    def flow_cost(self, state: BundleState) -> float:
-        """Compute the cost of chunks of edges in parallel."""
-        problem, options = self.problem, self.options
-
-        def work(chunk: slice) -> float:
-            return self.flow.cost(problem.part(chunk), state, options.huber)
-
-        return sum(thread_map(work, source_chunks(problem.source, options.chunk)))
 
     def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
         """Solve by Cholesky's method."""

@@ -36,7 +36,8 @@ class GridFields:
         if not bool((confidence > 0).any()):
             return torch.full_like(values, float(values.mean()))
         shape = (1, 1, self.grid.height, self.grid.width)
-        value, weight = values.reshape(shape), confidence.reshape(shape).clamp(min=0)
+        value = values.reshape(shape)
+        weight = confidence.reshape(shape).clamp(min=0)
         return torch.where(
             confidence > 0, values, _push_pull(value, weight).reshape(-1).to(values.dtype)
         )
@@ -52,7 +53,8 @@ class GridFields:
         Empty cells are filled from their surroundings and have no information.
         """
         grid = self.grid
-        R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
+        R = T_ji[:3, :3].to(inverse_depth)
+        t = T_ji[:3, 3].to(inverse_depth)
         z = (grid.rays @ R.mT + inverse_depth[:, None] * t)[:, 2]
         p = project(grid.camera, grid.rays, T_ji[None], inverse_depth[None])
         cell, hit = grid.cells_of(p.pixels[0])
@@ -73,18 +75,16 @@ class GridFields:
 
         The frame has no depth of its own; it uses the keyframe's.
         """
-        both = [self._reproject(k, T) for k, T in zip(keyframes, T_cw, strict=True)]
-        return torch.stack([there for there, _ in both]), torch.stack([back for _, back in both])
-
-    def _reproject(
-        self, keyframe: Keyframe, T_cw: Float[Tensor, "4 4"]
-    ) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
-        grid, own = self.grid, keyframe.inverse_depth
-        T = T_cw @ se3_inverse(keyframe.T_cw)
-        depth, _ = self.transfer(T, own, keyframe.information)
-        there = project(grid.camera, grid.rays, T[None], own[None])
-        back = project(grid.camera, grid.rays, se3_inverse(T)[None], depth[None])
-        return there.pixels[0], back.pixels[0]
+        grid = self.grid
+        there = []
+        back = []
+        for keyframe, T_frame in zip(keyframes, T_cw, strict=True):
+            own = keyframe.inverse_depth
+            T = T_frame @ se3_inverse(keyframe.T_cw)
+            depth, _ = self.transfer(T, own, keyframe.information)
+            there.append(project(grid.camera, grid.rays, T[None], own[None]).pixels)
+            back.append(project(grid.camera, grid.rays, se3_inverse(T)[None], depth[None]).pixels)
+        return torch.cat(there), torch.cat(back)
 
 
 def _push_pull(

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
+from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import CellProjection
 from geogs.bundle.protocols import BundleOptions
@@ -34,17 +34,6 @@ class SourceFlow:
     """Edges, with equations of the source's depths."""
     diagonal: Float[Tensor, "c"] | None = None
     """Diagonal of the chained equations before any depth is eliminated, if requested."""
-
-    @property
-    def depth(self) -> DepthEquations:
-        """Equations of the source's inverse depths."""
-        assert self.edges.depth is not None
-        return self.edges.depth
-
-    @property
-    def information(self) -> Float[Tensor, "p"]:
-        """Information of the source's inverse depths."""
-        return self.depth.information
 
 
 @runtime_checkable
@@ -87,7 +76,8 @@ def weighed_residuals(
 
     W is multiplied by Huber's weight of |W^(1/2) r|.
     """
-    r, w = pixels - p.pixels, weight * p.valid[..., None]
+    r = pixels - p.pixels
+    w = weight * p.valid[..., None]
     norm = (w * r.square()).sum(-1, keepdim=True).sqrt()
     return r, w * huber_weight(norm, huber)
 

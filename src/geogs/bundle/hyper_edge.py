@@ -8,7 +8,7 @@ others float64.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import torch
@@ -36,7 +36,8 @@ class DepthEquations:
         information: Float[Tensor, "p"] | None = None,
     ) -> "DepthEquations":
         """Return equations of depths without coupling; omitted parts are zero."""
-        none, zero = curvature.new_zeros(0, len(curvature)), torch.zeros_like(curvature)
+        none = curvature.new_zeros(0, len(curvature))
+        zero = torch.zeros_like(curvature)
         return DepthEquations(
             none,
             curvature,
@@ -72,7 +73,8 @@ class DepthEquations:
         self, hessian: Float[Tensor, "m m"], gradient: Float[Tensor, "m"]
     ) -> tuple[Float[Tensor, "m m"], Float[Tensor, "m"]]:
         """Eliminate the depths from the other equations: H - E C^-1 E^T, g - E C^-1 b."""
-        E, C = self.coupling, self.curvature
+        E = self.coupling
+        C = self.curvature
         return (
             hessian - ((E / C) @ E.mT).to(hessian),
             gradient - (E @ (self.gradient / C)).to(gradient),
@@ -90,7 +92,8 @@ class HyperEdge:
     """Direction of descent."""
     shared: int = 0
     """Number of the problem's shared unknowns, if it has them; they come last."""
-    depth: DepthEquations | None = None
+    depth: DepthEquations = field(default_factory=lambda: DepthEquations.alone(torch.zeros(0)))
+    """Equations of the inverse depths of one frame; by default of none."""
 
     @property
     def chain(self) -> Float[Tensor, "m c"]:
@@ -115,29 +118,35 @@ class HyperEdge:
 
     def chained_coupling(self) -> Float[Tensor, "c p"]:
         """Return the coupling of the depths with ``poses``, then shared unknowns."""
-        assert self.depth is not None
         return self.chain.mT.to(self.depth.coupling) @ self.depth.coupling
 
     def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
         """Return equations of its depths after a step of all poses and shared unknowns."""
-        assert self.depth is not None
         depth = replace(self.depth, coupling=self.chained_coupling())
         return depth.after(step[self.rows(frames)])
 
     def with_depths(self, others: Iterable[DepthEquations]) -> "HyperEdge":
         """Return it with other equations of the same depths added."""
-        assert self.depth is not None
         return replace(self, depth=reduce(DepthEquations.plus, others, self.depth))
 
     def eliminated(self) -> "HyperEdge":
         """Return it with the depths eliminated from the other equations."""
-        assert self.depth is not None
         hessian, gradient = self.depth.reduce(self.hessian, self.gradient)
         return replace(self, hessian=hessian, gradient=gradient)
 
+    def of_poses(self) -> "HyperEdge":
+        """Return it without the shared unknowns."""
+        size = len(self.gradient) - self.shared
+        return replace(
+            self,
+            hessian=self.hessian[:size, :size],
+            gradient=self.gradient[:size],
+            shared=0,
+            depth=replace(self.depth, coupling=self.depth.coupling[:size]),
+        )
+
     def without_coupling(self) -> "HyperEdge":
         """Return it without the coupling, which is large and only needed for the depths."""
-        assert self.depth is not None
         none = self.depth.coupling.new_zeros(0, len(self.depth.curvature))
         return replace(self, depth=replace(self.depth, coupling=none))
 
@@ -163,7 +172,7 @@ class RelativeEdges(HyperEdge):
 
     def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
         """Return equations of the source's depths, by the relative motions alone."""
-        if self.shared or self.depth is None:
+        if self.shared:
             return super().depth_after(step, frames)
         xi = step[: 6 * frames].reshape(frames, 6)
         relative = xi[self.poses[:-1]] - self.adjoint @ xi[self.poses[-1]]

@@ -43,11 +43,14 @@ class KeyframePairs:
         rest) over every second of the cells that stay in front of the target; infinite where
         less than 3/4 do or where less than a fifth falls into the image.
         """
-        grid, T = self.grid, self.motion
+        grid = self.grid
+        T = self.motion
         keep = torch.zeros(grid.height, grid.width, dtype=torch.bool)
         keep[::CELL_STEP, ::CELL_STEP] = True
         keep = keep.reshape(-1)
-        rays, pixels, d = grid.rays[keep], grid.pixels[keep], self.inverse_depth[:, keep]
+        rays = grid.rays[keep]
+        pixels = grid.pixels[keep]
+        d = self.inverse_depth[:, keep]
         shift = T.clone()
         shift[:, :3, :3] = torch.eye(3, dtype=T.dtype)
         total = valid = inside = torch.zeros(len(T))

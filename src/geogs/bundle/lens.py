@@ -41,9 +41,18 @@ class LensBlock:
         return self.focal, self.radial, self.radial, *of_rows
 
     @cached_property
-    def rays(self) -> "LensRays":
-        """Rays of the cells."""
-        return lens_rays(self.lens, self.pixels)
+    def rays(self) -> Float[Tensor, "p 3"]:
+        """Rays of the cells, with z = 1."""
+        x = self.lens.plane(self.pixels)
+        return torch.cat([x, torch.ones_like(x[:, :1])], -1)
+
+    @cached_property
+    def slopes(self) -> Float[Tensor, "3 p"]:
+        """Derivatives of the rays: d x / d log f, d x / d k1 and d x / d k2 are these factors times
+        x; likewise for y."""
+        square = self.rays[:, :2].square().sum(-1)
+        by = torch.stack([self.lens.growth(square), square, square.square()])
+        return -by / self.lens.steepness(square)
 
     def moved(self, step: Float[Tensor, "m"]) -> "LensBlock":
         """Return the block after a step of all unknowns, zero for those that are no variables."""
@@ -59,23 +68,4 @@ class LensBlock:
     ) -> CellProjection:
         """Project the cells of the sources into the targets; depths are those of the sources."""
         T_ji = relative_motion(T_cw, source, target)
-        return project(self.lens, self.rays.rays, T_ji, inverse_depth)
-
-
-@dataclass(frozen=True)
-class LensRays:
-    """Rays of pixels, with their derivatives by the lens."""
-
-    rays: Float[Tensor, "p 3"]
-    """Rays with z = 1."""
-    slope: Float[Tensor, "3 p"]
-    """d x / d log f, d x / d k1 and d x / d k2 are these factors times x; likewise for y."""
-
-
-def lens_rays(camera: Camera, pixels: Float[Tensor, "p 2"]) -> LensRays:
-    """Compute the rays of a camera's pixels."""
-    x = camera.plane(pixels)
-    square = x.square().sum(-1)
-    growth, steep = camera.growth(square), camera.steepness(square)
-    slope = torch.stack([-growth / steep, -square / steep, -square.square() / steep])
-    return LensRays(torch.cat([x, torch.ones_like(x[:, :1])], -1), slope)
+        return project(self.lens, self.rays, T_ji, inverse_depth)

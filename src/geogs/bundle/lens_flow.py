@@ -30,7 +30,8 @@ class LensFlow:
 
     def __init__(self, known: LensBlock | None = None, further: Further | None = None) -> None:
         """If no lens is ``known``, that of the state is an unknown."""
-        self._known, self._further = known, further
+        self._known = known
+        self._further = further
 
     @staticmethod
     def of(grid: SampleGrid) -> "LensFlow":
@@ -45,7 +46,8 @@ class LensFlow:
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         block = self._block(state)
-        adjoint, edges = se3_adjoint(T_ji), _Edges(block, problem, T_ji)
+        adjoint = se3_adjoint(T_ji)
+        edges = _Edges(block, problem, T_ji)
         limits = _limits(options.huber)
         slopes = edges.slopes if self._known is None else edges.slopes[:0]
         further = np.zeros((len(edges.weight), 0, 0, 2), np.float32)
@@ -56,7 +58,8 @@ class LensFlow:
         shared = len(slopes) + further.shape[1]
         for frame, e in sources_within(problem.source):
             size = 6 * (e.stop - e.start) + shared
-            H, g = adjoint.new_zeros(size, size), adjoint.new_zeros(size)
+            H = adjoint.new_zeros(size, size)
+            g = adjoint.new_zeros(size)
             depth = state.inverse_depth[frame].contiguous()
             E, C, b = depth.new_zeros(size, len(depth)), *depth.new_zeros(2, len(depth))
             linearise_source(
@@ -75,14 +78,21 @@ class LensFlow:
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         block = self._block(state)
         edges = _Edges(block, problem, T_ji)
-        behind, limits = np.float32((BEHIND * huber) ** 2), _limits(huber)
+        behind = np.float32((BEHIND * huber) ** 2)
+        limits = _limits(huber)
         return sum(
             cost_of_source(
-                edges.motions[e], edges.rays, edges.lens, _float(state.inverse_depth[frame]),
-                edges.pixels[e], edges.weight[e], limits, behind,
+                edges.motions[e],
+                edges.rays,
+                edges.lens,
+                _float(state.inverse_depth[frame]),
+                edges.pixels[e],
+                edges.weight[e],
+                limits,
+                behind,
             )
             for frame, e in sources_within(problem.source)
-        )  # fmt: skip
+        )
 
     def _block(self, state: BundleState) -> LensBlock:
         return self._known or cast(LensBlock, state.block)
@@ -96,7 +106,8 @@ class _Edges:
     ) -> None:
         lens = block.lens
         self.motions = _float(T_ji[:, :3])
-        self.rays, self.slopes = _float(block.rays.rays[:, :2].mT), _float(block.rays.slope)
+        self.rays = _float(block.rays[:, :2].mT)
+        self.slopes = _float(block.slopes)
         self.lens = np.array(lens.numbers, np.float32)
         self.pixels = _float(problem.unrolled(block.readout))
         self.weight = _float(problem.weight)

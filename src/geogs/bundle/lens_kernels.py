@@ -14,9 +14,11 @@ from geogs.geometry.camera import LEAST_SLOPE
 from geogs.kernel_parts import inlined
 
 _FAST = {
-    "cache": True, "nogil": True, "error_model": "numpy",
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz", "arcp"},  # non-finite values have to be kept
-}  # fmt: skip
+}
 _PART = inlined(_FAST)
 _BLOCK = 64
 """Cells whose derivatives are computed at a time: they fit into the L1 cache."""
@@ -53,13 +55,22 @@ def _dot(left, right):
 def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limits, J, r, w):
     """Compute derivatives of some cells for :func:`linearise_source`: the x of all, then the y. The
     last row of ``J`` is by the inverse depth."""
-    huber, nearest = limits[0], limits[1]
-    fx, fy, cx, cy, k1, k2 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    huber = limits[0]
+    nearest = limits[1]
+    fx = lens[0]
+    fy = lens[1]
+    cx = lens[2]
+    cy = lens[3]
+    k1 = lens[4]
+    k2 = lens[5]
     first, second = J[:, :_BLOCK], J[:, _BLOCK:]
-    shapes, last = len(slopes), len(J) - 1
+    shapes = len(slopes)
+    last = len(J) - 1
     tx, ty, tz = motion[0, 3], motion[1, 3], motion[2, 3]
     for n in range(rays.shape[1]):
-        x, y, d = rays[0, n], rays[1, n], inverse_depth[n]
+        x = rays[0, n]
+        y = rays[1, n]
+        d = inverse_depth[n]
         u, v, q, is_front = _seen(motion, x, y, d, nearest)
         square = u * u + v * v
         growth = _ONE + square * (k1 + square * k2)
@@ -68,23 +79,31 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
         xx, xy = fx * (growth + bent * u * u), fx * bent * u * v
         yx, yy = fy * bent * u * v, fy * (growth + bent * v * v)
         dq = d * q
-        first[0, n], second[0, n] = xx * dq, yx * dq
-        first[1, n], second[1, n] = xy * dq, yy * dq
+        first[0, n] = xx * dq
+        second[0, n] = yx * dq
+        first[1, n] = xy * dq
+        second[1, n] = yy * dq
         a, b = -u * dq, -v * dq
-        first[2, n], second[2, n] = xx * a + xy * b, yx * a + yy * b
+        first[2, n] = xx * a + xy * b
+        second[2, n] = yx * a + yy * b
         a, b = -u * v, -_ONE - v * v
-        first[3, n], second[3, n] = xx * a + xy * b, yx * a + yy * b
+        first[3, n] = xx * a + xy * b
+        second[3, n] = yx * a + yy * b
         a, b = _ONE + u * u, u * v
-        first[4, n], second[4, n] = xx * a + xy * b, yx * a + yy * b
-        first[5, n], second[5, n] = xy * u - xx * v, yy * u - yx * v
+        first[4, n] = xx * a + xy * b
+        second[4, n] = yx * a + yy * b
+        first[5, n] = xy * u - xx * v
+        second[5, n] = yy * u - yx * v
         a, b = (tx - tz * u) * q, (ty - tz * v) * q
-        first[last, n], second[last, n] = xx * a + xy * b, yx * a + yy * b
+        first[last, n] = xx * a + xy * b
+        second[last, n] = yx * a + yy * b
         if shapes:
             # A change of the lens moves the ray along (x, y, 0).
             z = motion[2, 0] * x + motion[2, 1] * y
             a = (motion[0, 0] * x + motion[0, 1] * y - z * u) * q
             b = (motion[1, 0] * x + motion[1, 1] * y - z * v) * q
-            along, across = xx * a + xy * b, yx * a + yy * b
+            along = xx * a + xy * b
+            across = yx * a + yy * b
             own_x, own_y = fx * u, fy * v
             first[6, n] = along * slopes[0, n] + own_x * growth
             second[6, n] = across * slopes[0, n] + own_y * growth
@@ -99,8 +118,10 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
         wy = weight[n, 1] if is_front else _ZERO
         norm = np.sqrt(wx * a * a + wy * b * b)
         robust = huber / (huber if norm < huber else norm)
-        r[n], r[_BLOCK + n] = a, b
-        w[n], w[_BLOCK + n] = wx * robust, wy * robust
+        r[n] = a
+        r[_BLOCK + n] = b
+        w[n] = wx * robust
+        w[_BLOCK + n] = wy * robust
 
 
 @njit(**_FAST)
@@ -117,11 +138,14 @@ def linearise_source(
     (m), the direction of descent; ``coupling`` (m, p) with the inverse depths, and their
     ``curvature`` (p) and gradient ``pull`` (p).
     """
-    edges, cells = weight.shape[0], weight.shape[1]
-    shapes, others = len(slopes), further.shape[1]
+    edges = weight.shape[0]
+    cells = weight.shape[1]
+    shapes = len(slopes)
+    others = further.shape[1]
     count = 6 + shapes + others
     J = np.zeros((count + 1, 2 * _BLOCK), np.float32)
-    r, w = np.zeros(2 * _BLOCK, np.float32), np.zeros(2 * _BLOCK, np.float32)
+    r = np.zeros(2 * _BLOCK, np.float32)
+    w = np.zeros(2 * _BLOCK, np.float32)
     wJ = np.zeros(2 * _BLOCK, np.float32)
     rows = np.empty(count, np.int64)
     for e in range(edges):
@@ -131,10 +155,18 @@ def linearise_source(
             end = min(begin + _BLOCK, cells)
             size = end - begin
             _derivatives(
-                motions[e], rays[:, begin:end], slopes[:, begin:end], lens,
-                inverse_depth[begin:end], pixels[e, begin:end], weight[e, begin:end], limits,
-                J, r, w,
-            )  # fmt: skip
+                motions[e],
+                rays[:, begin:end],
+                slopes[:, begin:end],
+                lens,
+                inverse_depth[begin:end],
+                pixels[e, begin:end],
+                weight[e, begin:end],
+                limits,
+                J,
+                r,
+                w,
+            )
             w[size:_BLOCK] = _ZERO
             w[_BLOCK + size :] = _ZERO
             for k in range(others):
@@ -164,8 +196,14 @@ def linearise_source(
 @njit(**_FAST)
 def cost_of_source(motions, rays, lens, inverse_depth, pixels, weight, limits, behind):
     """Return Huber's cost of a source's matched cells; ``behind`` is used behind their target."""
-    knee, nearest = limits[0], limits[1]
-    fx, fy, cx, cy, k1, k2 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    knee = limits[0]
+    nearest = limits[1]
+    fx = lens[0]
+    fy = lens[1]
+    cx = lens[2]
+    cy = lens[3]
+    k1 = lens[4]
+    k2 = lens[5]
     total = 0.0
     for e in range(len(weight)):
         motion = motions[e]

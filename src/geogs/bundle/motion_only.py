@@ -27,7 +27,10 @@ class MotionSolver:
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
         """Adjust each pose separately; return the poses and the residuals of the edges at them."""
-        camera, rays, d, frame = self.grid.camera, self.rays, problem.inverse_depth, problem.frame
+        camera = self.grid.camera
+        rays = self.rays
+        d = problem.inverse_depth
+        frame = problem.frame
         to_source = se3_inverse(problem.T_source)
 
         def linearised(T: Float[Tensor, "n 4 4"]) -> tuple[Tensor, Tensor]:
@@ -74,14 +77,20 @@ class MotionSolver:
         frame = torch.zeros(1, dtype=torch.long)
         T, residual = self.solve(
             MotionProblem(
-                T_guess[None], keyframe.inverse_depth[None], keyframe.T_cw[None], frame,
-                pixels[None], weight[None],
+                T_guess[None],
+                keyframe.inverse_depth[None],
+                keyframe.T_cw[None],
+                frame,
+                pixels[None],
+                weight[None],
             ),
-            iterations, huber,
-        )  # fmt: skip
+            iterations,
+            huber,
+        )
         used = weight[:, 0] > 0
         T_ji = T[0] @ se3_inverse(keyframe.T_cw)
-        turned = self._turned(T_ji)
+        infinite = self.grid.pixels.new_zeros(1, len(self.rays))
+        turned = project(self.grid.camera, self.rays, T_ji[None], infinite).pixels[0]
         error, flow, parallax = (
             x.norm(dim=-1) for x in (residual[0], pixels - self.grid.pixels, pixels - turned)
         )
@@ -90,8 +99,3 @@ class MotionSolver:
         matched, agreeing, known, placed_fraction = fractions
         medians = (x[used].median() for x in (error, flow, parallax))
         return T[0], T_ji, torch.stack([matched, agreeing, *medians, known, placed_fraction])
-
-    def _turned(self, T_ji: Float[Tensor, "4 4"]) -> Float[Tensor, "p 2"]:
-        """Project the cells by the camera's rotation alone, i.e. at infinite depth."""
-        far = self.grid.pixels.new_zeros(1, len(self.rays))
-        return project(self.grid.camera, self.rays, T_ji[None], far).pixels[0]

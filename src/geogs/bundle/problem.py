@@ -122,7 +122,8 @@ class MotionProblem:
 def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
     """Return the sources of sorted edges with their slices of edges."""
     frames, counts = torch.unique_consecutive(source, return_counts=True)
-    found, start = [], 0
+    found = []
+    start = 0
     for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
         found.append((frame, slice(start, start + count)))
         start += count
@@ -131,7 +132,9 @@ def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
 
 def source_chunks(source: Int[Tensor, "e"], size: int) -> list[slice]:
     """Return slices of about ``size`` edges that never split the edges of one source."""
-    chunks, start, last = [], 0, 0
+    chunks = []
+    start = 0
+    last = 0
     for _, edges in sources_within(source):
         if edges.stop - start > size and last > start:
             chunks.append(slice(start, last))

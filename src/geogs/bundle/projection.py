@@ -61,7 +61,8 @@ def seen_from_targets(
     coordinate of a target's cells is a row: many products of matrices with three columns take ten
     times as long as one with a column per cell.
     """
-    R, t = T_ji[..., :3, :3].to(inverse_depth), T_ji[..., :3, 3:].to(inverse_depth)
+    R = T_ji[..., :3, :3].to(inverse_depth)
+    t = T_ji[..., :3, 3:].to(inverse_depth)
     if rays.dim() == 2:
         turned = (R.reshape(-1, 3) @ rays.mT).reshape(*R.shape[:-1], len(rays))
     else:
@@ -113,7 +114,8 @@ def linearise(
 ) -> LinearProjection:
     """Do :func:`project` with the Jacobians in a left perturbation of T_ji and in d."""
     p = project(camera, rays, T_ji, inverse_depth)
-    t, q = T_ji[:, :3, 3].to(inverse_depth), 1 / p.z
+    t = T_ji[:, :3, 3].to(inverse_depth)
+    q = 1 / p.z
     plane = camera.plane(p.pixels)
     x, y = plane.unbind(-1)
     row_x, row_y = motion_rows(x, y, inverse_depth * q)
@@ -140,7 +142,8 @@ def carried_over(
 
     To first order; ``at`` is the projection of the cells by T_ji.
     """
-    focal, plane = at.pixels.new_tensor([camera.fx, camera.fy]), camera.plane(at.pixels)
+    focal = at.pixels.new_tensor([camera.fx, camera.fy])
+    plane = camera.plane(at.pixels)
     step = step / focal
     if not camera.is_pinhole:
         xx, xy, yy = camera.bend_jacobian(rays[:, :2])

@@ -11,13 +11,6 @@ from geogs.geometry.least_squares import Policy
 
 P = TypeVar("P", bound=Problem, contravariant=True)
 
-MAX_DAMPING = 1.0
-"""Largest Levenberg-Marquardt damping, relative to the diagonal."""
-TRIALS = 2
-"""Trial steps per allowed step."""
-COST_ROUNDING = 1e-6
-"""Relative error of a cost, as pixels are float32: a step that raises it by less ends the loop."""
-
 
 @dataclass(frozen=True)
 class BundleOptions:
@@ -53,11 +46,11 @@ class BundleOptions:
             return plain
         return replace(
             plain,
-            max_trials=TRIALS * self.iterations,
-            max_damping=MAX_DAMPING,
+            max_trials=2 * self.iterations,
+            max_damping=1.0,
             least_damping=self.least_damping,
             retries_unsolvable=True,
-            stall=COST_ROUNDING,
+            stall=1e-6,  # the relative error of a cost, as pixels are float32
         )
 
 

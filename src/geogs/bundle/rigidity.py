@@ -46,7 +46,8 @@ def best_residuals(
     Returns 0 where there is no match.
     """
     if not camera.is_pinhole:  # convert to a pinhole
-        plane, focal = camera.plane(pixels), pixels.new_tensor([camera.fx, camera.fy])
+        plane = camera.plane(pixels)
+        focal = pixels.new_tensor([camera.fx, camera.fy])
         pixels = plane * focal + pixels.new_tensor([camera.cx, camera.cy])
     if inverse_depth.is_cuda:
         from geogs.bundle.cuda import rigidity
@@ -68,7 +69,8 @@ def best_residuals(
         """Return projections of cells, 1 / z, whether they are in front, and residuals."""
         along = d[source]
         z = az + along * tz
-        valid, q = z > MIN_Z, 1 / z.clamp(min=MIN_Z)
+        valid = z > MIN_Z
+        q = 1 / z.clamp(min=MIN_Z)
         x, y = (ax + along * tx) * q, (ay + along * ty) * q
         rx, ry = ux - x, uy - y
         return x, y, q, valid, rx, ry, (wx * rx * rx + wy * ry * ry).sqrt()

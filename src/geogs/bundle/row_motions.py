@@ -88,7 +88,8 @@ def fitted_twists(
         known: whether velocity and depth of each cell are known.
     """
     J = _motions(camera, rays, inverse_depth).double().flatten(2)
-    v, weight = velocity.double().mT.flatten(1), known.double()
+    v = velocity.double().mT.flatten(1)
+    weight = known.double()
     speed = (velocity.norm(dim=-1) * known).sum(1) / known.sum(1).clamp(min=1)
     limit = (OFF * speed).clamp(min=1.0).double()[:, None]
     eye = torch.eye(6, dtype=torch.float64)

@@ -5,28 +5,34 @@ and the depths follow. Solvers differ in what they keep of linearised matches, a
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.problem import Problem
+from geogs.bundle.flow_term import FlowTerm
+from geogs.bundle.problem import BundleProblem, Problem, StreamedProblem, source_chunks
 from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Step, minimise
 from geogs.geometry.lie import move
+from geogs.threads import thread_map, worker_count
 
 P = TypeVar("P", bound=Problem)
+A = TypeVar("A", bound=BundleProblem | StreamedProblem)
 L = TypeVar("L")
+R = TypeVar("R")
 
 
 class SchurBundle(ABC, Generic[P, L]):
     """One adjustment; ``L``: type of a linearised problem."""
 
     def __init__(self, problem: P, options: BundleOptions) -> None:
-        self.problem, self.options = problem, options
+        self.problem = problem
+        self.options = options
         self.information = problem.known_before()
         """Information of every inverse depth at the last linearisation."""
 
@@ -77,6 +83,26 @@ class SchurBundle(ABC, Generic[P, L]):
         solution = minimise(self.problem.start, self.linearise, self.step, o.policy, cost)
         s = solution.state
         return BundleResult(s.T_cw, s.inverse_depth, self.information, solution.finite)
+
+
+class FlowSchur(SchurBundle[A, L]):
+    """One adjustment on the CPU, which linearises some edges at a time, several in parallel."""
+
+    def __init__(self, problem: A, flow: FlowTerm, options: BundleOptions) -> None:
+        super().__init__(problem, options)
+        self.flow = flow
+        self.chunks = source_chunks(problem.source, options.chunk)
+
+    def by_parts(self, work: Callable[[BundleProblem], R]) -> Iterator[R]:
+        """Yield results for some edges at a time, in order; a few of them are kept at a time."""
+        group = 8 * worker_count()
+        for start in range(0, len(self.chunks), group):
+            chunks = self.chunks[start : start + group]
+            yield from thread_map(lambda chunk: work(self.problem.part(chunk)), chunks)
+
+    def flow_cost(self, state: BundleState) -> float:
+        """Sum the cost of all parts, always in the same order."""
+        return sum(self.by_parts(lambda part: self.flow.cost(part, state, self.options.huber)))
 
 
 def stepped_depths(problem: Problem, moved: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:

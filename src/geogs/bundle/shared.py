@@ -71,7 +71,8 @@ def solve_shared(
         least_decrease=least_decrease,
     )
     found = minimise(start, shared.linearise, shared.step, policy, shared.cost)
-    state, linear = found.state, found.linear or shared.linearise(found.state)
+    state = found.state
+    linear = found.linear or shared.linearise(found.state)
     covariance = _covariance(linear)
     return SharedResult(
         state.T_cw,
@@ -95,7 +96,8 @@ class SharedSchur(DenseSchur):
     def linearise(self, state: BundleState) -> LinearBundle:
         """Linearise the problem, with a penalty that fixes the scale."""
         linear = super().linearise(state)
-        system, T = linear.system, state.T_cw
+        system = linear.system
+        T = state.T_cw
         diagonal = torch.zeros_like(system.gradient)
         for source in linear.sources:
             assert source.diagonal is not None
@@ -124,7 +126,8 @@ class SharedSchur(DenseSchur):
 def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
     """Return the median residual, in own deviations, of the matches in front of their targets, for
     an adjusted problem."""
-    source, depth = problem.source, result.inverse_depth[problem.source]
+    source = problem.source
+    depth = result.inverse_depth[problem.source]
     at = result.block.project(result.T_cw, source, problem.target, depth)
     found = residual_norms(at, problem.unrolled(result.block.readout), problem.weight)
     return float(found[at.valid & (problem.weight[..., 0] > 0)].median())
@@ -132,8 +135,11 @@ def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
 
 def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:
     """Compute the covariance of the block's unknowns, see :func:`solve_shared`."""
-    system, sources = linear.system, linear.sources
-    H, free, first = system.hessian, system.free, 6 * system.frames
+    system = linear.system
+    sources = linear.sources
+    H = system.hessian
+    free = system.free
+    first = 6 * system.frames
     out = H.new_zeros(len(H) - first, len(H) - first)
     chosen = free[free >= first] - first
     if not len(chosen) or len(sources) < 2:
@@ -146,9 +152,9 @@ def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:
         return out + torch.nan
     pull = H.new_zeros(len(H), len(chosen))
     pull[free] = rows
-    each = torch.stack([
-        pull[s.edges.rows(system.frames)].mT @ s.edges.chained()[1] for s in sources
-    ])  # fmt: skip
+    each = torch.stack(
+        [pull[s.edges.rows(system.frames)].mT @ s.edges.chained()[1] for s in sources]
+    )
     each = each - each.mean(0)
     common = len(sources) / (len(sources) - 1) * each.mT @ each
     out[chosen[:, None], chosen] = common + rows[-len(chosen) :]

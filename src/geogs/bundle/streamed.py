@@ -5,9 +5,7 @@ the camera system, and not kept; once the poses are known, the edges are lineari
 for the steps of the inverse depths.
 """
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -17,14 +15,11 @@ from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.flow_term import SourceFlow, linearised_sources
 from geogs.bundle.lens_flow import LensFlow
-from geogs.bundle.problem import StreamedProblem, source_chunks
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.protocols import BundleOptions, BundleResult
-from geogs.bundle.schur import SchurBundle
+from geogs.bundle.schur import FlowSchur
 from geogs.bundle.terms import BundleState
-from geogs.threads import thread_map, worker_count
 from geogs.world.grid import SampleGrid
-
-R = TypeVar("R")
 
 
 class StreamedBundle:
@@ -37,14 +32,12 @@ class StreamedBundle:
         return StreamedSchur(problem, self.grid, options).adjusted()
 
 
-class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
+class StreamedSchur(FlowSchur[StreamedProblem, SparseCameraSystem]):
     """One adjustment that only keeps the camera system of linearised edges."""
 
     def __init__(self, problem: StreamedProblem, grid: SampleGrid, options: BundleOptions) -> None:
-        super().__init__(problem, options)
-        self.flow = LensFlow.of(grid)
+        super().__init__(problem, LensFlow.of(grid), options)
         self.system = SparseCameraSystem(*problem.joined(), problem.free_pose)
-        self.chunks: Sequence[slice] = source_chunks(problem.source, options.chunk)
 
     def linearise(self, state: BundleState) -> SparseCameraSystem:
         """Linearise chunk by chunk, several in parallel."""
@@ -57,24 +50,15 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
     def add_matches(self, state: BundleState) -> None:
         """Add matches and depth terms, with depths eliminated, to the camera system."""
 
-        def work(chunk: slice) -> list[SourceFlow]:
-            part = self.problem.part(chunk)
+        def work(part: BundleProblem) -> list[SourceFlow]:
             sources = linearised_sources(self.flow, part, state, self.options)
             # The coupling with the depths is large, and not needed again.
             return [replace(s, edges=s.edges.without_coupling()) for s in sources]
 
-        for sources in _few_at_a_time(work, self.chunks):
+        for sources in self.by_parts(work):
             self.system.add(source.edges for source in sources)
             for source in sources:
-                self.information[source.frame] = source.information
-
-    def flow_cost(self, state: BundleState) -> float:
-        """Compute the cost chunk by chunk, several in parallel."""
-
-        def work(chunk: slice) -> float:
-            return self.flow.cost(self.problem.part(chunk), state, self.options.huber)
-
-        return sum(_few_at_a_time(work, self.chunks))
+                self.information[source.frame] = source.edges.depth.information
 
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
         """Solve by the Cholesky factor of a band."""
@@ -85,8 +69,9 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
     ) -> Float[Tensor, "n p"]:
         """Compute the depth steps from matches linearised a second time."""
 
-        def work(chunk: slice) -> list[tuple[int, Tensor]]:
-            part, frames, found = self.problem.part(chunk), len(state.T_cw), []
+        def work(part: BundleProblem) -> list[tuple[int, Tensor]]:
+            frames = len(state.T_cw)
+            found = []
             for source in self.flow.sources(part, state, self.options):
                 if bool(part.free_depth[source.frame]):
                     depth = source.edges.depth_after(step, frames)
@@ -96,14 +81,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
             return found
 
         delta = torch.zeros_like(state.inverse_depth)
-        for found in _few_at_a_time(work, self.chunks):
+        for found in self.by_parts(work):
             for frame, own in found:
                 delta[frame] = own
         return delta
-
-
-def _few_at_a_time(work: Callable[[slice], R], chunks: Sequence[slice]) -> Iterator[R]:
-    """Yield results in order, computed in parallel, a few of them kept at a time."""
-    group = 8 * worker_count()
-    for start in range(0, len(chunks), group):
-        yield from thread_map(work, chunks[start : start + group])

@@ -25,11 +25,6 @@ would shift image content by up to 0.04 pixels, most at a quarter of a pixel; th
 rolling shutter's rows pass through all such fractions."""
 FISHEYE_LIMIT = np.radians(88.0)
 """Angle from the axis up to which the plane z = 1 is used; rays beyond are clamped to it."""
-_POLISHING = 8
-"""Corrections after OpenCV's own few, which leave visible errors."""
-_HALVINGS = 52
-_FITTING = 4
-"""Steps of a fit of coefficients, most of which enter linearly."""
 
 
 def distorted_pixels(
@@ -47,13 +42,12 @@ def distorted_pixels(
         radius = np.linalg.norm(rays, axis=1, keepdims=True)
         bent = _bent(np.arctan(radius), distortion)
         rays = rays * np.divide(bent, radius, out=np.ones_like(bent), where=radius > 1e-12)
-        return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    if not any(distortion):
-        return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-    coefficients = np.array(distortion, dtype=np.float64)
-    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, coefficients)
-    return pixels[:, 0]
+    elif any(distortion):
+        points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+        coefficients = np.array(distortion, dtype=np.float64)
+        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, coefficients)
+        return pixels[:, 0]
+    return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 def undistorted_rays(
@@ -76,7 +70,7 @@ def undistorted_rays(
     coefficients = np.array(distortion, dtype=np.float64)
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None]
     rays = cv2.undistortPoints(points, camera.K, coefficients)[:, 0]
-    for _ in range(_POLISHING):
+    for _ in range(8):  # OpenCV's own few rounds leave visible errors
         rays = rays + (pixels - distorted_pixels(rays, camera, distortion)) / (camera.fx, camera.fy)
     return rays
 
@@ -85,7 +79,9 @@ def lens_maps(
     target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return column and row in the image of a lens for each pixel of a pinhole, float32."""
-    K, target_K, size = source.K, target.K, (target.width, target.height)
+    K = source.K
+    target_K = target.K
+    size = (target.width, target.height)
     D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
     if lens == "fisheye":
         maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
@@ -116,9 +112,11 @@ def with_bend(
     seen = distorted_pixels(factor * (bent + shift), camera, distortion, lens)
     ((cx, cy),) = distorted_pixels(factor * np.array([shift]), camera, distortion, lens).tolist()
     camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy, cx=cx, cy=cy)
-    found, step = np.array(distortion or (0.0,) * 4), 1e-4
-    for _ in range(_FITTING):
-        off, columns = seen - distorted_pixels(rays, camera, tuple(found), lens), []
+    found = np.array(distortion or (0.0,) * 4)
+    step = 1e-4
+    for _ in range(4):  # most coefficients enter linearly
+        off = seen - distorted_pixels(rays, camera, tuple(found), lens)
+        columns = []
         for change in step * np.eye(len(found)):
             low, high = (
                 distorted_pixels(rays, camera, tuple(found + s * change), lens) for s in (-1, 1)
@@ -130,7 +128,8 @@ def with_bend(
 
 def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
     """Return the radius of an angle in a fisheye image of focal length 1."""
-    square, factor = angle**2, np.zeros_like(angle)
+    square = angle**2
+    factor = np.zeros_like(angle)
     for k in reversed(coefficients):
         factor = square * (k + factor)
     return angle * (1 + factor)
@@ -145,7 +144,7 @@ def _straight(radius: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
     falls = np.flatnonzero(np.diff(_bent(angles, coefficients)) <= 0)
     high = np.full_like(radius, angles[falls[0]] if len(falls) else FISHEYE_LIMIT)
     low = np.zeros_like(radius)
-    for _ in range(_HALVINGS):
+    for _ in range(52):  # to all digits
         middle = (low + high) / 2
         is_below = _bent(middle, coefficients) < radius
         low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)

@@ -15,9 +15,6 @@ from geogs.camera.distortion import RESAMPLING, lens_maps
 from geogs.geometry.camera import Camera
 from geogs.types import FoundLens, FrameLens
 
-SAME = 1e-3
-"""Largest round-trip error through the lens, in pixels, at which a pixel counts as shown."""
-
 
 @dataclass(frozen=True)
 class StraightView:
@@ -57,8 +54,8 @@ class StraightView:
         """Map pixels of the lens to pixels of the pinhole; NaN where the lens shows nothing, as
         beyond the maximum of a polynomial's radius."""
         plane = self.seen_by.plane(pixels.double())
-        is_shown = (self.seen_by.pixels(plane) - pixels).norm(dim=-1, keepdim=True) < SAME
-        return torch.where(is_shown, self.camera.pixels(plane), torch.nan).to(pixels)
+        error = (self.seen_by.pixels(plane) - pixels).norm(dim=-1, keepdim=True)
+        return torch.where(error < 1e-3, self.camera.pixels(plane), torch.nan).to(pixels)
 
     # --- images ----------------------------------------------------------------------------
 
@@ -94,12 +91,12 @@ class StraightView:
 
 @dataclass(frozen=True)
 class FrameViews:
-    """Views of the frames of a video, whose intrinsics may vary."""
+    """Views of the frames of a video, or of its keyframes, whose intrinsics may vary."""
 
     view: StraightView
     """View of the shared lens."""
     own: Mapping[int, FrameLens] = field(default_factory=dict)
-    """Per-frame intrinsics by the indices of the frames."""
+    """Per-frame intrinsics by the indices of the frames, or the ids of the keyframes."""
 
     def of(self, frame: int) -> StraightView:
         """Return the view of a frame."""
@@ -113,8 +110,10 @@ class FrameViews:
         """
         if frame not in self.own:
             return image
-        common, own = self.view.seen_by, self.of(frame).seen_by
+        common = self.view.seen_by
+        own = self.of(frame).seen_by
         factor = common.fx / own.fx
         right, down = common.cx - factor * own.cx, common.cy - factor * own.cy
-        to, size = np.array([[factor, 0, right], [0, factor, down]]), (common.width, common.height)
+        to = np.array([[factor, 0, right], [0, factor, down]])
+        size = (common.width, common.height)
         return cv2.warpAffine(image, to, size, flags=RESAMPLING, borderMode=cv2.BORDER_REPLICATE)

@@ -39,16 +39,17 @@ def demo(options: DemoOptions) -> int:
     from geogs.application.machine.compilation import compiling
     from geogs.gpu.installation import require_device
 
-    room, result = str(options.output / "room"), str(options.output / "result")
+    room = str(options.output / "room")
+    result = str(options.output / "result")
+    sizes = list[str]()
+    for name in ("frames", "width", "height", "seed"):
+        sizes += [f"--{name}", str(getattr(options, name))]
     with compiling(require_device("auto")) as kernels:
         steps: dict[str, tuple[Callable[[Sequence[str]], int], list[str]]] = {
-            "synth": (find_command("synth").run, [
-                room, "--frames", str(options.frames), "--width", str(options.width),
-                "--height", str(options.height), "--seed", str(options.seed),
-            ]),
+            "synth": (find_command("synth").run, [room, *sizes]),
             "run": (partial(run.main, kernels=kernels), [room, "-o", result]),
             "eval": (find_command("eval").run, [result, "--gt", room]),
-        }  # fmt: skip
+        }
         for name, (command, arguments) in steps.items():
             print(f"$ geogs {name} {' '.join(arguments)}", flush=True)
             code = command(arguments)

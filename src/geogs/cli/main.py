@@ -25,8 +25,6 @@ _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN er
 """Beginnings of PyTorch's errors that no command has translated."""
 _UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EIO, errno.ESTALE, errno.EROFS)
 """System errors for unusable paths."""
-_MIN_MEMORY = 1 << 30
-"""Least address space in bytes; below it, native imports abort the process."""
 _LONG_WORD = re.compile(r"(\S{80})\S{100,}(\S{80})")
 """A word that is shortened to both of its ends, such as a wrongly joined path."""
 
@@ -59,7 +57,8 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     command = find_command(name)
     process.show_warnings()
-    if _memory_limit() < _MIN_MEMORY:
+    # Least address space in bytes; below it, native imports abort the process.
+    if _memory_limit() < 1 << 30:
         raise MemoryError
     return command.run(rest)
 
@@ -69,16 +68,18 @@ def help_text() -> str:
     commands = all_commands()
     width = max(map(len, commands))
     rows = [f"  {name:<{width}}  {command.help}" for name, command in commands.items()]
-    return "\n".join([
-        "Dense monocular SLAM with a map of geometry-only Gaussian disks.",
-        "",
-        "usage: geogs COMMAND [OPTIONS]",
-        "",
-        "commands:",
-        *rows,
-        "",
-        "geogs COMMAND --help lists the options of a command; geogs --version tells the version.",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "Dense monocular SLAM with a map of geometry-only Gaussian disks.",
+            "",
+            "usage: geogs COMMAND [OPTIONS]",
+            "",
+            "commands:",
+            *rows,
+            "",
+            "geogs COMMAND --help lists the options of a command; geogs --version, the version.",
+        ]
+    )
 
 
 def print_error(sentence: str) -> None:

@@ -12,7 +12,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse_options(RemeshSettings, argv, "mesh", _defaults)
 
     from geogs.application.progress.terminal_progress import TerminalProgress
-    from geogs.application.results.remesh import remesh
+    from geogs.application.results.revise import remesh
 
     with TerminalProgress() as progress:
         path = remesh(options, progress)
@@ -22,7 +22,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _defaults(given: Given) -> RemeshSettings:
     """The settings of the result."""
-    from geogs.application.results.remesh import mesh_settings
+    from geogs.application.results.revise import mesh_settings
 
     folder = Path(given["result"])
     return RemeshSettings(folder, mesh_settings(folder))

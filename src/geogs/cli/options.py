@@ -49,7 +49,8 @@ def parse_options(
     for leaf in known:
         if words and leaf.mark(Positional) is not None:
             taken = len(words) if leaf.kind.is_tuple else 1
-            given[leaf.name], words = words[:taken], words[taken:]
+            given[leaf.name] = words[:taken]
+            words = words[taken:]
     if words:
         raise InputError(f"geogs {command} cannot do anything with {words[0]}.")
     missing = [leaf for leaf in known if leaf.name not in given and _is_needed(leaf, given)]
@@ -149,7 +150,8 @@ def _made(
     """
     changed: dict[str, Any] = {}
     for field in fields(options):
-        at, inner = (*path, field.name), group_of(field.type)
+        at = (*path, field.name)
+        inner = group_of(field.type)
         if inner is not None and any(p[: len(at)] == at for p in values):
             own = default_of(field) if default is None else getattr(default, field.name)
             changed[field.name] = _made(inner, None if own is MISSING else own, values, at)

@@ -7,7 +7,7 @@ from typing import cast
 
 from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.terminal.speech import followed, say_loading
+from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, reconstruct_preset
 from geogs.gpu.early_start import is_gpu, start_gpu
 
@@ -23,12 +23,21 @@ class ReconstructOptions(Verbosity, ReconstructSettings):
     preset: Preset = "default"
     """Group of settings; single ones given beside it win. Without it, accurate on a GPU and default
     on a CPU."""
+    dry_run: bool = False
+    """Only say what the input holds and how it is read; with --poses given."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     begin = time.perf_counter()
     options = parse(argv)
+    if options.dry_run:
+        from geogs.io.sources.posed.pose_check import with_focal_length
+        from geogs.io.sources.sniff import open_posed_source
+
+        source = open_posed_source(options.source, options.config.input, options.hold_out)
+        say_input(with_focal_length(source))
+        return 0
     say_loading(options)
     start_gpu(options.device)
     settings = record(ReconstructSettings, options)

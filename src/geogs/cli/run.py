@@ -1,8 +1,13 @@
 """``geogs run SOURCE``: a video in; trajectory, mesh and disk map out."""
 
+import os
+import select
 import sys
-from collections.abc import Sequence
-from contextlib import nullcontext
+import termios
+import threading
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,8 +16,7 @@ from typing import TYPE_CHECKING, cast
 from geogs.application.result_settings import HERE
 from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.terminal.quit_key import quit_key
-from geogs.cli.terminal.speech import followed, say_loading
+from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
@@ -39,6 +43,8 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
     settings; beside it may be given what decides nothing about poses and map: --device, --mesh,
     --checkpoint-every, --fallback, --online-results, --depth-mesh, --keyframe-images and
     --scale-from."""
+    dry_run: bool = False
+    """Only say what the input holds and how it is read."""
 
 
 def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
@@ -50,6 +56,15 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
     if options.offline and options.map is not None:
         raise InputError("--map is gone on with by tracking; leave out --offline.")
 
+    if options.dry_run:
+        from geogs.application.calibrate import without_overlay
+        from geogs.application.progress.terminal_progress import TerminalProgress
+        from geogs.io.sources.sniff import open_source
+
+        opened = open_source(options.source, options.config.input)
+        say_input(opened)
+        without_overlay(opened, TerminalProgress(options))
+        return 0
     say_loading(options)
     start_gpu(options.device)
     from geogs.application.interrupt import Interruption
@@ -114,3 +129,34 @@ def _defaults(given: Given) -> RunOptions:
     if "preset" in given:
         raise InputError("--resume goes on with the run's settings; leave out --preset.")
     return RunOptions(**vars(SavedRun(folder).settings), resume=folder)
+
+
+@contextmanager
+def quit_key(stop: Callable[[], None]) -> Iterator[bool]:
+    """Call ``stop`` when q is pressed in the block; yields whether keys can be read.
+
+    They cannot if standard input is no terminal. Its mode is restored afterwards.
+    """
+    try:
+        keys = sys.stdin.fileno()
+        before = termios.tcgetattr(keys)
+    except (AttributeError, OSError, ValueError, termios.error):
+        yield False
+        return
+    ended = threading.Event()
+
+    def listen() -> None:
+        while not ended.is_set():
+            if select.select([keys], [], [], 0.2)[0] and os.read(keys, 1) in (b"q", b"Q"):
+                stop()
+                return
+
+    thread = threading.Thread(target=listen, name="keys", daemon=True)
+    tty.setcbreak(keys)
+    thread.start()
+    try:
+        yield True
+    finally:
+        ended.set()
+        thread.join()
+        termios.tcsetattr(keys, termios.TCSADRAIN, before)

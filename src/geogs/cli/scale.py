@@ -10,7 +10,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse_options(RescaleSettings, argv, "scale")
 
-    from geogs.application.results.rescale import rescale
+    from geogs.application.results.revise import rescale
     from geogs.application.scale.measurable_scene import scale_sentence
 
     print(scale_sentence(rescale(options)))

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from operator import attrgetter
 
-from geogs.config.loss_config import LossConfig
 from geogs.config.mapping_config import MappingConfig
 from geogs.config.prior_config import DepthSensorConfig, OdometryConfig
 from geogs.config.reconstruct_config import ReconstructConfig
@@ -32,17 +31,18 @@ def idle_settings(
     ``is_live`` that its frames do not wait.
     """
     if isinstance(config, ReconstructConfig):
-        return [*_mapping(config.mapping)]
+        return list(_mapping(config.mapping))
     of_map = _deferred(config) if maps_at_end else _on_the_way(config.mapping, is_live)
     return [*_run(config), *of_map, *_mapping(config.mapping)]
 
 
 def _deferred(config: Config) -> Iterator[str]:
-    mapping, usual = config.mapping, preset(preset_of(config)).mapping
+    mapping = config.mapping
+    usual = preset(preset_of(config)).mapping
     if not usual.may_follow:  # what such a preset sets is meant for a map that is made on the way
         usual = MappingConfig()
-    values = [(path, attrgetter(path)) for path in ON_THE_WAY]
-    idle = [f"mapping.{dashed(path)}" for path, of in values if of(mapping) != of(usual)]
+    changed = [path for path in ON_THE_WAY if attrgetter(path)(mapping) != attrgetter(path)(usual)]
+    idle = [f"mapping.{dashed(path)}" for path in changed]
     if idle:
         yield (
             f"{', '.join(idle)} {'does' if len(idle) == 1 else 'do'} nothing: the map is made of "
@@ -61,14 +61,15 @@ def _on_the_way(mapping: MappingConfig, is_live: bool) -> Iterator[str]:
             "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "
             "searched again."
         )
-    if mapping.pose_iterations == 0 and mapping.pose_lr != MappingConfig.pose_lr:
-        yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."
-    if mapping.pose_iterations == 0 and mapping.pose_every != MappingConfig.pose_every:
-        yield "mapping.pose-every does nothing: mapping.pose-iterations is 0."
+    for name in ("pose_lr", "pose_every") if mapping.pose_iterations == 0 else ():
+        if getattr(mapping, name) != getattr(MappingConfig, name):
+            yield f"mapping.{dashed(name)} does nothing: mapping.pose-iterations is 0."
 
 
 def _run(config: Config) -> Iterator[str]:
-    tracking, prior, mapping = config.tracking, config.prior, config.mapping
+    tracking = config.tracking
+    prior = config.prior
+    mapping = config.mapping
     if tracking.weights and tracking.operator in ("auto", "classical"):
         yield (
             "tracking.weights does nothing: the classical operator has none; tracking.operator "
@@ -78,11 +79,8 @@ def _run(config: Config) -> Iterator[str]:
         yield "prior.card does nothing without prior.model."
     if prior.normal_card and not prior.normal_model:
         yield "prior.normal-card does nothing without prior.normal-model."
-    if config.input.depth == "none":
-        if config.sensor != DepthSensorConfig():
-            yield "sensor does nothing: input.depth is none, so that no measured depth is used."
-        if mapping.loss.measured_factor != LossConfig.measured_factor:
-            yield "mapping.loss.measured-factor does nothing: input.depth is none."
+    if config.input.depth == "none" and config.sensor != DepthSensorConfig():
+        yield "sensor does nothing: input.depth is none, so that no measured depth is used."
     if config.input.poses == "none" and config.odometry != OdometryConfig():
         yield "odometry does nothing: input.poses is none, so that no measured pose is used."
     if mapping.when == "after" and not mapping.may_follow:
@@ -100,12 +98,5 @@ def _mapping(mapping: MappingConfig) -> Iterator[str]:
             f"mapping.depth.weights does nothing: the engine {mapping.depth.engine} has none; "
             "network or joint takes them."
         )
-    if loss.smoothness_weight == 0 and loss.ablation.smoothness_rewards_edges:
-        yield (
-            "mapping.loss.ablation.smoothness-rewards-edges does nothing: "
-            "mapping.loss.smoothness-weight is 0."
-        )
-    if loss.occlusion_ratio > 0 and loss.occlusion != LossConfig.occlusion:
-        yield "mapping.loss.occlusion does nothing beside mapping.loss.occlusion-ratio."
     if loss.colour and max(loss.l1_weight, loss.ssim_weight) == 0:
         yield "mapping.loss.colour does nothing: L_1 and L_ssim have no weight."

@@ -27,6 +27,11 @@ class InputConfig(Settings, group="input"):
     depth: Annotated[Literal["none", "auto", "sensor"], Only("run"), Basic("--depth")] = "none"
     """Depth that a sensor measured, beside the images: none leaves it, auto takes it where there
     is any, sensor must have it. With it the result is in metres."""
+    depth_unit: Annotated[
+        float | Literal["auto"], Range(1e-3, 1e6), Only("run"), Basic("--depth-unit")
+    ] = "auto"
+    """Units of the depth images per metre, such as 1000 for millimetres; auto takes that of a file
+    beside them, else that of the data set where the depths can be a sensor's by it."""
     poses: Annotated[str, NamesFile(("none", "auto", "prior")), Only("run"), Basic("--poses")] = (
         "auto"
     )
@@ -45,6 +50,11 @@ class InputConfig(Settings, group="input"):
     mask_overlay: Annotated[bool, Only("run")] = True
     """Whether what all images show at the same place while all else moves, such as a time stamp, is
     masked out, where no mask is given."""
+    take: Annotated[str, Only("run"), Basic("--take")] = "auto"
+    """Part of each image to use: left, right, top or bottom of a stereo pair in one picture; front,
+    back or 360:YAW,PITCH (degrees to the right and upwards), a view of 90 degrees of a 360-degree
+    panorama; a half and a view joined by +, such as top+front. auto takes all and refuses stereo
+    pairs and panoramas, none takes all unasked. Given intrinsics hold for the part."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

@@ -9,16 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeVar, get_args
 
-from geogs.config.setting import (
-    Basic,
-    Kind,
-    Only,
-    Positional,
-    Unnamed,
-    dashed,
-    group_of,
-    kinds,
-)
+from geogs.config.setting import Basic, Kind, Only, Positional, Unnamed, dashed, group_of, kinds
 
 T = TypeVar("T")
 
@@ -57,11 +48,6 @@ class Leaf:
         group = f"{self.group}." if self.group else ""
         return f"--{group}no-{dashed(self.path[-1])}"
 
-    def is_offered_by(self, command: str) -> bool:
-        """Whether a command heeds it: all but those for which :class:`Only` another is."""
-        only: Only | None = self.mark(Only)
-        return only is None or only.command == command
-
     def mark(self, kind: type) -> Any:
         """Mark in its type, such as :class:`Basic`; none if it does not."""
         return next((mark for mark in self.kind.marks if isinstance(mark, kind)), None)
@@ -72,8 +58,11 @@ def leaves(tree: object, command: str = "") -> tuple[Leaf, ...]:
 
     With a command, without those that are :class:`Only` for another.
     """
-    found = _of_class(tree) if isinstance(tree, type) else tuple(_leaves(tree, (), ""))
-    return tuple(leaf for leaf in found if not command or leaf.is_offered_by(command))
+    return tuple(
+        leaf
+        for leaf in _leaves(tree, (), "")
+        if not command or (only := leaf.mark(Only)) is None or only.command == command
+    )
 
 
 def with_values(tree: T, values: Mapping[tuple[str, ...], object]) -> T:
@@ -100,14 +89,10 @@ def default_of(field: Any) -> Any:
     return field.default if field.default_factory is MISSING else field.default_factory()
 
 
-@functools.cache
-def _of_class(tree: type) -> tuple[Leaf, ...]:
-    return tuple(_leaves(tree, (), ""))
-
-
 def _leaves(tree: Any, path: tuple[str, ...], group: str) -> Iterator[Leaf]:
     kind = tree if isinstance(tree, type) else type(tree)
-    helps, settings = _helps(kind), dict(kinds(kind))
+    helps = _helps(kind)
+    settings = dict(kinds(kind))
     for field in fields(kind):
         default = default_of(field) if tree is kind else getattr(tree, field.name)
         at = (*path, field.name)

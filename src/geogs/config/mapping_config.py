@@ -34,27 +34,27 @@ class DiskConfig(Settings, group="mapping.disk"):
     edge_stride: Annotated[int, Range(1, 100)] = 2
     """The same near jumps of the keyframe's depth, if that is less: disks there are as much smaller
     and hardly overhang the edge."""
-    insert_confidence: Fraction = 0.3
+    insert_confidence: Annotated[Fraction, Only("python")] = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
-    fill_confidence: Fraction = 0.1
+    fill_confidence: Annotated[Fraction, Only("python")] = 0.1
     """Least confidence of a depth that makes a disk where nothing better has come since."""
-    fit_normals: bool = True
+    fit_normals: Annotated[bool, Only("python")] = True
     """Lay a new disk into the plane of the depths around its pixel, as far as to the next disk,
     where there is one; off takes that of the points nearest to it, as the paper does."""
-    scale_factor: Positive = 0.6
+    scale_factor: Annotated[Positive, Only("python")] = 0.6
     """Initial standard deviation in distances to the nearest points."""
-    bound_spacing: bool = True
+    bound_spacing: Annotated[bool, Only("python")] = True
     """Keep that distance within 0.3 to 1.5 of the distance between samples, so that a stray point
     makes neither a speck nor a blanket; off as in the paper."""
-    planarity_threshold: Fraction = 0.05
+    planarity_threshold: Annotated[Fraction, Only("python")] = 0.05
     """Below this planarity the initial scale shrinks."""
-    planarity_shrink: Positive = 0.5
+    planarity_shrink: Annotated[Positive, Only("python")] = 0.5
     """Factor of that shrinking; the paper's is 0.1."""
-    opacity: Annotated[float, Range(1e-4, 0.9999)] = 0.7
+    opacity: Annotated[float, Range(1e-4, 0.9999), Only("python")] = 0.7
     """Initial opacity."""
-    max_scale: Positive = 0.05
+    max_scale: Annotated[Positive, Only("python")] = 0.05
     """Largest standard deviation, in u."""
-    min_scale: Annotated[float, Range(1e-9, "max_scale")] = 4e-4
+    min_scale: Annotated[float, Range(1e-9, "max_scale"), Only("python")] = 4e-4
     """Smallest standard deviation, in u."""
     carve: bool = True
     """Remove disks that stand in the free space of keyframes, and make none there."""
@@ -64,13 +64,13 @@ class DiskConfig(Settings, group="mapping.disk"):
 class PhotoConfig(Settings, group="mapping.photo"):
     """Choice of the keyframes that check each other's depth by their images (L_mv)."""
 
-    max_view_angle: Angle = 35.0
+    max_view_angle: Annotated[Angle, Only("python")] = 35.0
     """Largest angle between the optical axes, degrees."""
-    candidates: Annotated[int, Range(1, 1000)] = 6
+    candidates: Annotated[int, Range(1, 1000), Only("python")] = 6
     """Partners kept per keyframe."""
     per_step: Annotated[int, Range(1, 64)] = 2
     """Partners drawn in each step."""
-    fresh: bool = False
+    fresh: Annotated[bool, Only("python")] = False
     """Render the partners anew in every step for the occlusion test, as the paper does; off takes
     what they showed when they were trained last."""
     compensate_exposure: bool = True

@@ -113,9 +113,7 @@ def paper_tracking() -> TrackingConfig:
     """DROID-SLAM's network where its file is found, and the paper's keyframes: a mean motion of 2.4
     cells of 8 pixels makes one, which stays, so that it is mapped as soon as it exists."""
     return TrackingConfig(
-        operator="droid_if_found",
-        keyframe_mean_flow=0.031,
-        keyframe_distance=0.0,
+        operator="droid_if_found", keyframe_mean_flow=0.031, keyframe_distance=0.0
     )
 
 

@@ -90,9 +90,12 @@ class Basic:
 
 @dataclass(frozen=True)
 class Only:
-    """A setting that other commands than this one do not heed, and do not offer."""
+    """A setting that other commands than this one do not heed, and do not offer.
 
-    command: Literal["run", "reconstruct"]
+    No command offers those for ``python``, which presets and programs set.
+    """
+
+    command: Literal["run", "reconstruct", "python"]
 
 
 @dataclass(frozen=True)
@@ -152,7 +155,8 @@ class Kind:
     @staticmethod
     def of(annotation: Any, marks: tuple[object, ...] = ()) -> "Kind":
         """The kind that a type describes. Raises TypeError for one that no setting can have."""
-        origin, inner = get_origin(annotation), get_args(annotation)
+        origin = get_origin(annotation)
+        inner = get_args(annotation)
         if origin is Annotated:
             return Kind.of(inner[0], (*inner[1:], *marks))
         if origin in (Union, types.UnionType) and len(inner) == 2:

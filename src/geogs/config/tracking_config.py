@@ -9,6 +9,7 @@ from geogs.config.setting import (
     CountOrZero,
     Fraction,
     NamesFile,
+    Only,
     Range,
     Settings,
     Weight,
@@ -48,10 +49,10 @@ class TrackingConfig(Settings, group="tracking"):
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge,
     without what the camera's rotation alone does; before depths are known, 1.4 times that in
     all."""
-    keyframe_overlap: Fraction = 0.7
+    keyframe_overlap: Annotated[Fraction, Only("python")] = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""
-    keyframe_mean_flow: Fraction = 0.0
+    keyframe_mean_flow: Annotated[Fraction, Only("python")] = 0.0
     """Mean motion since the last keyframe, of the long edge, that makes a frame a keyframe whatever
     its parallax, overlap and sharpness, as in the paper; 0 leaves it to these."""
     keyframe_distance: Fraction = 0.009
@@ -60,7 +61,7 @@ class TrackingConfig(Settings, group="tracking"):
     mapped, as soon as it exists."""
     init_keyframes: Annotated[int, Range(4, 1000)] = 12
     """Keyframes gathered before the map is started."""
-    window: Annotated[int, Range(1, 1000)] = 8
+    window: Annotated[int, Range(1, 1000), Only("python")] = 8
     """Most recent keyframes whose poses the local adjustment moves."""
     fine_adjustment: bool = True
     """Match at full resolution for the adjustment of all keyframes, and find the readout of a
@@ -86,16 +87,16 @@ class LoopConfig(Settings, group="loop"):
     """Keyframes that lie at least between the two views of a loop."""
     appearance: CountOrZero = 5
     """Candidates taken from the index per keyframe; 0 looks only where the present poses say."""
-    close_every: Count = 5
+    close_every: Annotated[Count, Only("python")] = 5
     """Keyframes between two corrections, at least."""
-    residual: Weight = 5.0
+    residual: Annotated[Weight, Only("python")] = 5.0
     """Squared error of a loop at the present poses, in its own variances, from which it calls for a
     correction. Variances are cautious: right loops come to 1 or 2, where 7 would be exact."""
     matches: bool = False
     """Adjust the matches of loops and of the frame graph together with the relative poses, depths
     included, when a loop is closed (the paper's Sim(3) bundle adjustment); off leaves it at the
     relative poses."""
-    min_change: Weight = 0.002
+    min_change: Annotated[Weight, Only("python")] = 0.002
     """Corrections that move no keyframe by more than this are not worth it for the map: radians,
     parts of its median depth, or of its scale."""
     global_ba_every: Annotated[CountOrZero, Basic("--global-ba-every")] = 0

@@ -30,7 +30,8 @@ def look_up(
 
     ``T_view`` takes the frame of the points to the view's camera. Finite input only.
     """
-    ratio, confidence = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
+    ratio = np.empty(len(points), np.float32)
+    confidence = np.empty(len(points), np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     rotation = np.ascontiguousarray(T_view[:3, :3], np.float32)
     translation = np.ascontiguousarray(T_view[:3, 3], np.float32)
@@ -52,7 +53,8 @@ def count_votes(
     if the point is more than ``VOTE_VIOLATION`` in front of it (both relative).
     """
     points = np.ascontiguousarray(points, np.float32)
-    surface, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    surface = np.zeros(len(points), np.int32)
+    free = np.zeros(len(points), np.int32)
     for pose, depth in views:
         ratio, confidence = look_up(points, pose, depth, camera)
         votes = confidence > VOTE_CONFIDENCE

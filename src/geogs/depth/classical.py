@@ -53,7 +53,8 @@ class CpuDepthEngine:
             own, rest = pair
             if not rest:
                 return own.depth
-            arrays, poses = [o.depth.arrays() for o in rest], [o.T_cw for o in rest]
+            arrays = [o.depth.arrays() for o in rest]
+            poses = [o.T_cw for o in rest]
             checked = check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render)
             return replace(DenseDepth.of(checked), normal=own.depth.normal)
 
@@ -91,6 +92,6 @@ class CpuDepthEngine:
 
     def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""
-        from geogs.depth.revision.far_side import farther_surface
+        from geogs.depth.revision.revised_searches import farther_surface
 
         return farther_surface(depth, reach)

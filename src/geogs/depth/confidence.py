@@ -31,9 +31,7 @@ WEIGHTS = ConfidenceWeights()
 
 
 def depth_confidence(
-    refined: SlantedDepth,
-    margin: Float32[np.ndarray, "h w"],
-    tracker: TrackerEvidence,
+    refined: SlantedDepth, margin: Float32[np.ndarray, "h w"], tracker: TrackerEvidence
 ) -> Float32[np.ndarray, "h w"]:
     """Chance that each depth is right to 2 %.
 
@@ -41,7 +39,8 @@ def depth_confidence(
     with the refined inverse depth; depth jumps to the next pixels; the support of the last plane
     fit.
     """
-    w, depth = WEIGHTS, 1.0 / refined.inverse_depth
+    w = WEIGHTS
+    depth = 1.0 / refined.inverse_depth
     kernel = np.ones((3, 3), np.uint8)
     jump = np.log(cv2.dilate(depth, kernel) / cv2.erode(depth, kernel)) / w.tolerance
     known = np.minimum(tracker.precision * np.float32(w.tolerance**2), 1.0)

@@ -1,6 +1,5 @@
 """Interface of the estimators of keyframe depths that the mapper uses."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -8,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
-from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""
@@ -77,7 +75,8 @@ class AlternativeSearch:
 
     def __init__(self, classical: DepthEngine) -> None:
         self.classical = classical
-        self.keep, self.photo_costs = classical.keep, classical.photo_costs
+        self.keep = classical.keep
+        self.photo_costs = classical.photo_costs
         self.farther_surface = classical.farther_surface
 
     def observe(self, view: DepthView) -> None:
@@ -89,23 +88,3 @@ class AlternativeSearch:
     ) -> list[DenseDepth]:
         """As in the protocol."""
         return self.classical.check(depths, others)
-
-
-class RevisedSearch(AlternativeSearch, ABC):
-    """Another engine's search, followed by a revision of each single depth."""
-
-    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
-        """As in the protocol."""
-        searched = self.classical.estimate(tasks, progress)
-
-        def one(pair: tuple[DepthTask, DenseDepth]) -> DenseDepth:
-            task, found = pair
-            return self.revised(task.view, task.neighbours, found)
-
-        return thread_map(one, list(zip(tasks, searched, strict=True)))
-
-    @abstractmethod
-    def revised(
-        self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
-    ) -> DenseDepth:
-        """The revised depth of a view that was matched with some others."""

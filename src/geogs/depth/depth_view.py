@@ -100,7 +100,8 @@ class DenseDepth:
 
     def within(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
         """The depth with confidence 0 outside the mask; the median is that of the inside."""
-        inside, confidence = self.depth[mask], torch.where(mask, self.confidence, 0.0)
+        inside = self.depth[mask]
+        confidence = torch.where(mask, self.confidence, 0.0)
         if not len(inside):
             return replace(self, confidence=confidence)
         return replace(self, confidence=confidence, median=inside.median().cpu(), written=None)
@@ -161,7 +162,8 @@ def homographies(
     """a and b: pixel p of the reference's ``source`` camera at inverse depth rho appears at
     a p + rho b (homogeneous) in each neighbour's ``target`` camera.
     """
-    k, back = target.matrix().numpy(), np.linalg.inv(source.matrix().numpy())
+    k = target.matrix().numpy()
+    back = np.linalg.inv(source.matrix().numpy())
     relative = relative_poses(reference, neighbours)
     return k @ relative[:, :3, :3] @ back, relative[:, :3, 3] @ k.T
 

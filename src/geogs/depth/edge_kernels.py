@@ -34,14 +34,18 @@ def _add_sides(
     ones, and the weighted inverse depths of the farther and of the nearer ones.
     """
     # Views, because an index that could be negative would keep the loop from vectorising.
-    own, there = rho[y, first:last], rho[v, first + dx : last + dx]
+    own = rho[y, first:last]
+    there = rho[v, first + dx : last + dx]
     gx, gy = slope_x[v, first + dx : last + dx], slope_y[v, first + dx : last + dx]
     conf = confidence[v, first + dx : last + dx]
     g0, g1, g2 = guide[0, y, first:last], guide[1, y, first:last], guide[2, y, first:last]
     k0, k1 = guide[0, v, first + dx : last + dx], guide[1, v, first + dx : last + dx]
     k2 = guide[2, v, first + dx : last + dx]
-    same, far, near = sums[0, first:last], sums[1, first:last], sums[2, first:last]
-    far_sum, near_sum = sums[3, first:last], sums[4, first:last]
+    same = sums[0, first:last]
+    far = sums[1, first:last]
+    near = sums[2, first:last]
+    far_sum = sums[3, first:last]
+    near_sum = sums[4, first:last]
     right, down = np.float32(dx), np.float32(v - y)
     low, high = ONE - gap, ONE + gap
     for x in range(last - first):
@@ -49,7 +53,8 @@ def _add_sides(
         like = ONE + contrast * (d0 * d0 + d1 * d1 + d2 * d2)
         value = there[x] - gx[x] * right - gy[x] * down
         weight = conf[x] / (like * like)
-        is_far, is_near = value <= own[x] * low, value >= own[x] * high
+        is_far = value <= own[x] * low
+        is_near = value >= own[x] * high
         of_far = weight if is_far & (value > ZERO) else ZERO
         of_near = weight if is_near else ZERO
         same[x] += ZERO if is_far | is_near else weight
@@ -89,26 +94,31 @@ def _mode(samples, count, low, high, start, width, rounds, mode):
     Mean shift from ``start`` with Cauchy's kernel of relative ``width``. ``mode`` receives inverse
     depth, slopes and confidence; returns their weight.
     """
-    centre, total = start, ZERO
+    centre = start
+    total = ZERO
     across = down = conf = ZERO
-    values, slopes_x, slopes_y = samples[0], samples[1], samples[2]
-    weights, confidences = samples[3], samples[4]
     for _ in range(rounds):
         inverse = ONE / (width * centre)
         total = place = across = down = conf = ZERO
         for i in range(count):
-            value = values[i]
+            value = samples[0, i]
             away = (value - centre) * inverse
             is_within = (low < value) & (value < high)
-            weight = weights[i] / (ONE + away * away) if is_within else ZERO
+            weight = samples[3, i] / (ONE + away * away) if is_within else ZERO
             total += weight
             place += weight * value
-            across += weight * slopes_x[i]
-            down += weight * slopes_y[i]
-            conf += weight * confidences[i]
+            across += weight * samples[1, i]
+            down += weight * samples[2, i]
+            conf += weight * samples[4, i]
         scale = ONE / max(total, np.float32(1e-12))
-        centre, across, down, conf = place * scale, across * scale, down * scale, conf * scale
-    mode[0], mode[1], mode[2], mode[3] = centre, across, down, conf
+        centre = place * scale
+        across = across * scale
+        down = down * scale
+        conf = conf * scale
+    mode[0] = centre
+    mode[1] = across
+    mode[2] = down
+    mode[3] = conf
     return total
 
 
@@ -127,8 +137,10 @@ def resolve_edges(
     """
     h, w = rho.shape
     samples = np.empty((5, (2 * reach + 1) ** 2), np.float32)
-    mode, sums = np.empty(4, np.float32), np.empty((5, w), np.float32)
-    little, enough = np.float32(0.1), np.float32(0.3)
+    mode = np.empty(4, np.float32)
+    sums = np.empty((5, w), np.float32)
+    little = np.float32(0.1)
+    enough = np.float32(0.3)
     for y in range(first, last):
         sums[:] = ZERO
         for v in range(max(y - reach, 0), min(y + reach + 1, h)):
@@ -138,13 +150,17 @@ def resolve_edges(
                     guide, contrast, gap, sums,
                 )  # fmt: skip
         for x in range(w):
-            own, same = rho[y, x], sums[0, x]
-            new_rho[y, x], new_x[y, x], new_y[y, x] = own, slope_x[y, x], slope_y[y, x]
+            own = rho[y, x]
+            same = sums[0, x]
+            new_rho[y, x] = own
+            new_x[y, x] = slope_x[y, x]
+            new_y[y, x] = slope_y[y, x]
             new_confidence[y, x] = confidence[y, x]
             if max(sums[1, x], sums[2, x]) < enough:
                 continue
             far, near = own * (ONE - gap), own * (ONE + gap)
-            best, count = ZERO, 0
+            best = ZERO
+            count = 0
             here = _cost_at(costs[y, x], plane, spacing, own)
             for side in range(2):
                 weight = sums[1 + side, x]
@@ -165,5 +181,7 @@ def resolve_edges(
                 score = np.log((weight + little) / (same + little)) + trust * gain
                 if score > best:
                     best = score
-                    new_rho[y, x], new_x[y, x], new_y[y, x] = mode[0], mode[1], mode[2]
+                    new_rho[y, x] = mode[0]
+                    new_x[y, x] = mode[1]
+                    new_y[y, x] = mode[2]
                     new_confidence[y, x] = moved * mode[3]

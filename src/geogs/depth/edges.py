@@ -14,8 +14,6 @@ from geogs.threads import over_rows
 
 REACH = 0.019
 """Half side of the window of pixels that vote, in long edges of the image: 6 pixels of 320."""
-LEAST_REACH = 4
-"""Least reach in pixels."""
 CONTRAST = 300.0
 """Rate c of a pixel's weight 1 / (1 + c |dI|^2)^2 by its colour difference."""
 MIN_GAP = 0.015
@@ -33,8 +31,8 @@ MOVED_CONFIDENCE = 0.7
 
 
 def reach_of(shape: tuple[int, ...]) -> int:
-    """``REACH`` in pixels of an image."""
-    return max(LEAST_REACH, round(REACH * max(shape)))
+    """``REACH`` in pixels of an image, at least four."""
+    return max(4, round(REACH * max(shape)))
 
 
 def resolve_edges(
@@ -52,7 +50,8 @@ def resolve_edges(
     is the image in [0, 1].
     """
     maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
-    f, planes = np.float32, sweep.planes
+    f = np.float32
+    planes = sweep.planes
     spacing = (planes[-1] - planes[0]) / f(len(planes) - 1)
     settings = [f(x) for x in (CONTRAST, MIN_GAP, WIDTH, COST_TRUST)]
     for _ in range(PASSES):

@@ -4,24 +4,20 @@ import torch
 
 from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthEngine
-from geogs.depth.revision.far_side import FarSideSearch
-from geogs.depth.revision.unbounded import SkySearch
+from geogs.depth.revision.revised_searches import FarSideSearch, SkySearch
 from geogs.geometry.camera import Camera
 
 
 def depth_engine(
-    device: torch.device | str,
-    render: Camera,
-    working: Camera,
-    config: DepthConfig,
-    resident: int,
+    device: torch.device | str, render: Camera, working: Camera, config: DepthConfig, resident: int
 ) -> DepthEngine:
     """The engine that the settings name for a map on ``device``: depths at the size of ``render``,
     from images at the size of ``working``, of which a GPU holds the ``resident`` used last.
 
     Raises InputError if the network is chosen and its weights are not found or do not fit.
     """
-    device, engine = torch.device(device), config.engine
+    device = torch.device(device)
+    engine = config.engine
     if device.type == "cuda":
         from geogs.depth.cuda.classical import CudaDepthEngine
 
@@ -46,6 +42,6 @@ def depth_engine(
     network = NetworkDepthEngine(trained, classical, device, render, working, resident)
     if engine == "network":
         return SkySearch(network)
-    from geogs.depth.network.joint import JointDepthEngine
+    from geogs.depth.network.engine import JointDepthEngine
 
     return SkySearch(JointDepthEngine(network, classical))

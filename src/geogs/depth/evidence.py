@@ -67,7 +67,8 @@ def choose_start(
 
     The depth is the sweep's, or the tracker's where that is confident and the sweep not better.
     """
-    prior, confidence = tracker.inverse_depth, tracker.prior_weight
+    prior = tracker.inverse_depth
+    confidence = tracker.prior_weight
     unique = np.clip(0.5 * sweep.margin - 0.25, 0.0, 1.0) * (sweep.cost < 0.8)
     agree = np.abs(sweep.inverse_depth / prior - 1.0) < 0.05
     taken = (agree & (confidence > 0.3)) | ((confidence > 0.5) & (unique < 0.3))
@@ -79,7 +80,8 @@ def choose_start(
 
 def _flatness(inverse_depth: Float32[np.ndarray, "gh gw"]) -> Float32[np.ndarray, "gh gw"]:
     """Weight near 1 on planes, near 0 where inverse depth bends sharply between cells."""
-    q, bend = inverse_depth, np.zeros_like(inverse_depth)
+    q = inverse_depth
+    bend = np.zeros_like(inverse_depth)
     bend[:, 1:-1] = np.abs(q[:, 2:] + q[:, :-2] - 2.0 * q[:, 1:-1])
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(q[2:] + q[:-2] - 2.0 * q[1:-1]))
     return np.exp(-((bend / (np.float32(KINK) * q)) ** 2))

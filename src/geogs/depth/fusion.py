@@ -76,20 +76,24 @@ def _repair(
 ) -> KeyframeDepth:
     """The depth with pixels of low confidence replaced by confident ones of other views."""
     shape = (len(others), *depth.depth.shape)
-    seen, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    seen = np.zeros(shape, np.float32)
+    weight = np.zeros(shape, np.float32)
     rays = camera.rays().numpy().reshape(-1, 3)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    least = np.float32(SPLAT_CONFIDENCE)
     for j, (other, pose) in enumerate(zip(others, other_poses, strict=True)):
         relative = np.linalg.inv(pose @ T_wc).astype(np.float32)
         points = other.depth.reshape(-1, 1) * rays
-        splat_depth(
-            points, other.confidence.ravel(), np.ascontiguousarray(relative[:3, :3]),
-            np.ascontiguousarray(relative[:3, 3]), lens, np.float32(SPLAT_CONFIDENCE), seen[j],
-            weight[j],
-        )  # fmt: skip
-    best, score = np.empty_like(depth.depth), np.empty_like(depth.depth)
-    reach, clearance = np.float32(AGREEMENT_REACH), np.float32(VIOLATION_DISTANCE)
-    uncertain, penalty = depth.confidence < REPAIR_BELOW, np.float32(OCCLUSION_PENALTY)
+        confidence = other.confidence.ravel()
+        rotation = np.ascontiguousarray(relative[:3, :3])
+        translation = np.ascontiguousarray(relative[:3, 3])
+        splat_depth(points, confidence, rotation, translation, lens, least, seen[j], weight[j])
+    best = np.empty_like(depth.depth)
+    score = np.empty_like(depth.depth)
+    reach = np.float32(AGREEMENT_REACH)
+    clearance = np.float32(VIOLATION_DISTANCE)
+    uncertain = depth.confidence < REPAIR_BELOW
+    penalty = np.float32(OCCLUSION_PENALTY)
     agree_on_depth(seen, weight, uncertain, reach, clearance, penalty, best, score)
     taken = uncertain & (score > REPAIR_VOTES)
     confidence = np.where(taken, np.float32(REPAIR_CONFIDENCE), depth.confidence)

@@ -111,7 +111,8 @@ def _smoothness_bands(weight: Float32[np.ndarray, "gh gw"], typical: float) -> n
     w = weight.astype(np.float64).T
     gw, gh = w.shape
     bands = np.zeros((2 * gh + 1, gw, gh))
-    bend, stretch = 1.0 / (BENDING * typical), 1.0 / (MEMBRANE * typical)
+    bend = 1.0 / (BENDING * typical)
+    stretch = 1.0 / (MEMBRANE * typical)
     for axis, step in ((0, gh), (1, 1)):
         v = np.moveaxis(w, axis, 0)
         terms: list[tuple[tuple[float, ...], np.ndarray]] = [
@@ -135,10 +136,5 @@ def upsample_grid(
     columns = ((u - OFFSET) / STRIDE).astype(np.float32)
     rows = ((v - OFFSET) / STRIDE).astype(np.float32)
     x, y = np.meshgrid(columns, rows)
-    return cv2.remap(
-        np.ascontiguousarray(grid, np.float32),
-        x,
-        y,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    values = np.ascontiguousarray(grid, np.float32)
+    return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -102,7 +102,8 @@ def plane_sweep(
     volume = np.empty_like(raw)
     sharpness = np.float32(SUPPORT_SHARPNESS)
     weight = np.float32(PRIOR_PULL) * prior_weight
-    tolerance, radius = np.float32(PRIOR_TOLERANCE), SUPPORT_RADIUS
+    tolerance = np.float32(PRIOR_TOLERANCE)
+    radius = SUPPORT_RADIUS
 
     def support(first: int, last: int) -> None:
         kernels.average_support(first, last, raw, colours, radius, sharpness, volume)
@@ -115,11 +116,10 @@ def plane_sweep(
     raw.fill(0.0)  # used again, as volumes take most of the memory
     totals = raw, np.zeros_like(raw)
     run_chunks(
-        lambda k: kernels.aggregate_paths(
-            volume, guide, small, large, contrast, k == 0, totals[k]
-        ),
-        len(totals), worker_count(),
-    )  # fmt: skip
+        lambda k: kernels.aggregate_paths(volume, guide, small, large, contrast, k == 0, totals[k]),
+        len(totals),
+        worker_count(),
+    )
     total = np.add(*totals, out=totals[0])
     position, cost, margin = (np.empty_like(guide) for _ in range(3))
     over_rows(

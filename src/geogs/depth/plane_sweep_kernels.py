@@ -54,7 +54,9 @@ def _warp_row(pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fr
         fraction_v[x] = cv - whole_v
         index[x] = np.uint32(np.int32(whole_v * np.float32(w) + whole_u))
     fetch_pairs(pairs, index, top, low)
-    upper, lower, own = top.view(np.float32), low.view(np.float32), warped[radius:]
+    upper = top.view(np.float32)
+    lower = low.view(np.float32)
+    own = warped[radius:]
     for x in range(count):
         above = upper[2 * x] + fraction_u[x] * (upper[2 * x + 1] - upper[2 * x])
         below = lower[2 * x] + fraction_u[x] * (lower[2 * x + 1] - lower[2 * x])
@@ -65,19 +67,23 @@ def _warp_row(pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fr
 
 
 @njit(**_PART)
-def _row_sums(reference, warped, radius, ones, squares, products):
-    """Sums of b, b^2 and a b over 2 radius + 1 columns; rows have ``radius`` repeats a side."""
+def _row_sums(reference, warped, radius, i, sums):
+    """Sums of b, b^2 and a b over 2 radius + 1 columns into row ``i`` of each of the ``sums``; rows
+    have ``radius`` repeats a side."""
+    ones = sums[0, i]
+    squares = sums[1, i]
+    products = sums[2, i]
     for x in range(ones.shape[0]):
         b0, b1, b2 = warped[x], warped[x + 1], warped[x + 2]
         ones[x] = b0 + b1 + b2
         squares[x] = b0 * b0 + b1 * b1 + b2 * b2
         products[x] = b0 * reference[x] + b1 * reference[x + 1] + b2 * reference[x + 2]
-    for i in range(3, 2 * radius + 1):
+    for k in range(3, 2 * radius + 1):
         for x in range(ones.shape[0]):
-            b = warped[x + i]
+            b = warped[x + k]
             ones[x] += b
             squares[x] += b * b
-            products[x] += b * reference[x + i]
+            products[x] += b * reference[x + k]
 
 
 @njit(**_PART)
@@ -93,13 +99,16 @@ def _column_sums(rows, first, radius, out):
 
 
 @njit(**_PART)
-def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
+def _ncc_row(sums, mean, scale, lowest, norm, floor, best):
     """1 - NCC from the window sums, inserted into the sorted smallest costs ``best`` (keep, w).
 
     ``scale`` is 1 / sqrt(variance + floor) of the reference windows, which reduces the similarity
     of textureless windows to nothing.
     """
     keep = best.shape[0]
+    sum_b = sums[0]
+    sum_bb = sums[1]
+    sum_ab = sums[2]
     for x in range(sum_b.shape[0]):
         m = sum_b[x] * norm
         spread = max(sum_bb[x] * norm - m * m, np.float32(0.0)) + floor
@@ -159,7 +168,8 @@ def match_planes(first, last, reference, mean, scale, pairs, a, b, planes, radiu
     lowest = np.empty((STRIP + 2 * radius, w), np.float32)
     index = np.empty(w, np.uint32)
     fraction_u, fraction_v = np.empty(w, np.float32), np.empty(w, np.float32)
-    top, low = np.empty(w, np.uint64), np.empty(w, np.uint64)
+    top = np.empty(w, np.uint64)
+    low = np.empty(w, np.uint64)
     rows_of = np.empty((3, STRIP + 2 * radius, w), np.float32)
     sums = np.empty((3, w), np.float32)
     least = np.int32(min(2, pairs.shape[0]))
@@ -182,19 +192,14 @@ def match_planes(first, last, reference, mean, scale, pairs, a, b, planes, radiu
                             pairs[j], a[j], b[j], planes[start + k], y, radius, warped, lowest[i],
                             index, fraction_u, fraction_v, top, low,
                         )  # fmt: skip
-                        _row_sums(
-                            reference[y], warped, radius, rows_of[0, i], rows_of[1, i],
-                            rows_of[2, i],
-                        )  # fmt: skip
+                        _row_sums(reference[y], warped, radius, i, rows_of)
                     for i in range(rows):
                         y = y0 + i
                         for s in range(3):
                             _column_sums(rows_of[s], i, radius, sums[s])
-                        _ncc_row(
-                            sums[0], sums[1], sums[2], mean[y], scale[y], lowest[i + radius],
-                            norm, floor, best[i],
-                        )  # fmt: skip
-                        _count_inside(lowest[i + radius], seen[i])
+                        least_cost = lowest[i + radius]
+                        _ncc_row(sums, mean[y], scale[y], least_cost, norm, floor, best[i])
+                        _count_inside(least_cost, seen[i])
                 for i in range(rows):
                     _mean_of_better_half(best[i], seen[i], least, block[i, k])
             for i in range(rows):
@@ -206,13 +211,18 @@ def _likeness_of_row(guide, y, v, dx, contrast, weights):
     """1 / (1 + contrast |dI|^2)^2 of the pixels of row ``y`` and those (dx, v - y) away; 0 where
     there is none."""
     w = guide.shape[1]
-    first, last, one = max(0, -dx), min(w, w - dx), np.float32(1.0)
+    first = max(0, -dx)
+    last = min(w, w - dx)
+    one = np.float32(1.0)
     weights[:first] = np.float32(0.0)
     weights[last:] = np.float32(0.0)
     # Views, because an index that could be negative would keep the loop from vectorising.
-    here, there, out = guide[y, first:last], guide[v, first + dx : last + dx], weights[first:last]
+    here = guide[y, first:last]
+    there = guide[v, first + dx : last + dx]
+    out = weights[first:last]
     for x in range(last - first):
-        red, green = here[x, 0] - there[x, 0], here[x, 1] - there[x, 1]
+        red = here[x, 0] - there[x, 0]
+        green = here[x, 1] - there[x, 1]
         blue = here[x, 2] - there[x, 2]
         like = one + contrast * (red * red + green * green + blue * blue)
         out[x] = one / (like * like)
@@ -234,15 +244,18 @@ def average_support(first, last, volume, guide, radius, contrast, out):
             for i in range(2 * radius + 1):
                 _likeness_of_row(guide, y, v, i - radius, contrast, weights[v - top, i])
         for x in range(w):
-            mean, total = out[y, x], np.float32(0.0)
+            mean = out[y, x]
+            total = np.float32(0.0)
             for k in range(planes):
                 mean[k] = np.float32(0.0)
             left, right = max(x - radius, 0), min(x + radius + 1, w)
             for v in range(top, bottom):
-                j, u = v - top, left
+                j = v - top
+                u = left
                 while u < right:
                     i = u + radius - x
-                    a, p = volume[v, u], weights[j, i, x]
+                    a = volume[v, u]
+                    p = weights[j, i, x]
                     if u + 4 <= right:
                         b, c, d = volume[v, u + 1], volume[v, u + 2], volume[v, u + 3]
                         q, r = weights[j, i + 1, x], weights[j, i + 2, x]
@@ -252,7 +265,8 @@ def average_support(first, last, volume, guide, radius, contrast, out):
                         total += p + q + r + s
                         u += 4
                     elif u + 2 <= right:
-                        b, q = volume[v, u + 1], weights[j, i + 1, x]
+                        b = volume[v, u + 1]
+                        q = weights[j, i + 1, x]
                         for k in range(planes):
                             mean[k] += p * a[k] + q * b[k]
                         total += p + q
@@ -275,7 +289,8 @@ def pull_to_prior(first, last, volume, planes, prior, weight, tolerance):
         for x in range(volume.shape[1]):
             pull = weight[y, x]
             if pull > np.float32(0.0):
-                cost, inverse = volume[y, x], one / prior[y, x]
+                cost = volume[y, x]
+                inverse = one / prior[y, x]
                 for k in range(planes.shape[0]):
                     cost[k] += pull * min(abs(planes[k] * inverse - one) / tolerance, one)
 
@@ -312,7 +327,8 @@ def aggregate_paths(volume, image, small, large, edge, forward, total):
         y = i if forward else h - 1 - i
         for j in range(w):
             x = j if forward else w - 1 - j
-            cost, out = volume[y, x], total[y, x]
+            cost = volume[y, x]
+            out = total[y, x]
             for direction in range(4):
                 dx = s * (direction - 1) if direction < 3 else s
                 dy = s if direction < 3 else 0
@@ -340,10 +356,12 @@ def pick_planes(first, last, total, volume, position, cost, margin):
     for y in range(first, last):
         for x in range(w):
             t = total[y, x]
-            best, low = 0, t[0]
+            best = 0
+            low = t[0]
             for k in range(1, planes):
                 if t[k] < low:
-                    best, low = k, t[k]
+                    best = k
+                    low = t[k]
             second = FAR
             for k in range(0, best - 2):
                 second = min(second, t[k])

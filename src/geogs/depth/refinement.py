@@ -1,7 +1,7 @@
 """Depth beyond the sweep's planes: slanted patches at the working resolution, and local planes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -71,11 +71,10 @@ class _Patches:
 
     def every(self, step: int) -> "_Patches":
         """The patches with every ``step``-th sample."""
-        if step == 1:
-            return self
-        samples, weights = self.samples[::step].copy(), self.weights[::step].copy()
+        samples = self.samples[::step].copy()
         offsets = self.offsets[::step].copy()
-        return replace(self, samples=samples, offsets=offsets, weights=weights)
+        weights = self.weights[::step].copy()
+        return _Patches(samples, offsets, weights, self.pairs, self.a, self.b)
 
 
 def refine_depth(
@@ -171,10 +170,7 @@ def colour_guide(reference: DepthView, render: Camera) -> Float32[np.ndarray, "3
 
 
 def _gather_patches(
-    reference: DepthView,
-    neighbours: Sequence[DepthView],
-    render: Camera,
-    working: Camera,
+    reference: DepthView, neighbours: Sequence[DepthView], render: Camera, working: Camera
 ) -> _Patches:
     """The fine reference image around every render pixel; similarity to the centre as weight."""
     reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)
@@ -191,11 +187,5 @@ def _gather_patches(
     contrast = (samples - samples[len(samples) // 2]) ** 2
     weights = 1.0 / (1.0 + np.float32(PATCH_CONTRAST) * contrast)
     a, b = homographies(reference, neighbours, render, working)
-    return _Patches(
-        samples=samples,
-        offsets=offsets,
-        weights=weights,
-        pairs=pixel_pairs(np.stack([v.fine for v in neighbours]) - np.float32(0.5)),
-        a=a,
-        b=b,
-    )
+    pairs = pixel_pairs(np.stack([v.fine for v in neighbours]) - np.float32(0.5))
+    return _Patches(samples, offsets, weights, pairs, a, b)

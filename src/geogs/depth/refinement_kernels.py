@@ -53,29 +53,30 @@ def _place_row(pairs, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, du,
 
 
 @njit(**_PART)
-def _add_samples_of_row(reference, weight, top, low, fu, fv, du, dv, sums):
+def _add_moments(reference, weight, top, low, fu, fv, du, dv, sums):
     """Weighted first and second moments of reference a with sample b and its derivative g by
     inverse depth, and of these: b, g, bb, gg, ab, ag, bg. ``top`` and ``low`` are the samples'
     pixels in pairs."""
-    sb, sg, sbb, sgg, sab, sag, sbg = (
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
-    )  # fmt: skip
     for x in range(fu.shape[0]):
-        left_top, left_low = top[2 * x], low[2 * x]
-        right_top, right_low = top[2 * x + 1] - left_top, low[2 * x + 1] - left_low
+        left_top = top[2 * x]
+        left_low = low[2 * x]
+        right_top = top[2 * x + 1] - left_top
+        right_low = low[2 * x + 1] - left_low
         above, below = left_top + fu[x] * right_top, left_low + fu[x] * right_low
         down = below - above
         across = right_top + (right_low - right_top) * fv[x]
-        q, g = above + fv[x] * down, across * du[x] + down * dv[x]
-        m, p = weight[x], reference[x]
+        q = above + fv[x] * down
+        g = across * du[x] + down * dv[x]
+        m = weight[x]
+        p = reference[x]
         mp, mq, mg = m * p, m * q, m * g
-        sb[x] += mq
-        sg[x] += mg
-        sbb[x] += mq * q
-        sgg[x] += mg * g
-        sab[x] += mp * q
-        sag[x] += mp * g
-        sbg[x] += mq * g
+        sums[0, x] += mq
+        sums[1, x] += mg
+        sums[2, x] += mq * q
+        sums[3, x] += mg * g
+        sums[4, x] += mp * q
+        sums[5, x] += mp * g
+        sums[6, x] += mq * g
 
 
 @njit(**_FAST)
@@ -93,7 +94,10 @@ def photometric_step(
     count, _, w = patches.shape
     n = pairs.shape[0]
     index = np.empty(w, np.uint32)
-    top, low = np.empty(w, np.uint64), np.empty(w, np.uint64)
+    top = np.empty(w, np.uint64)
+    low = np.empty(w, np.uint64)
+    upper = top.view(np.float32)
+    lower = low.view(np.float32)
     fu, fv = np.empty(w, np.float32), np.empty(w, np.float32)
     du, dv = np.empty(w, np.float32), np.empty(w, np.float32)
     inside = np.empty(w, np.float32)
@@ -114,10 +118,7 @@ def photometric_step(
                     slope_x[y], slope_y[y], index, fu, fv, du, dv, inside,
                 )  # fmt: skip
                 fetch_pairs(pairs[j], index, top, low)
-                _add_samples_of_row(
-                    patches[s, y], weights[s, y], top.view(np.float32), low.view(np.float32), fu,
-                    fv, du, dv, sums,
-                )  # fmt: skip
+                _add_moments(patches[s, y], weights[s, y], upper, lower, fu, fv, du, dv, sums)
             _add_neighbour(own, sums, inside, floor, total)
         for x in range(w):
             curvature[y, x] = total[1, x]
@@ -127,12 +128,12 @@ def photometric_step(
 @njit(**_PART)
 def _accumulate_own(reference, weight, own):
     """Weighted first and second moments of reference a, the same for all neighbours."""
-    sw, sa, saa = own[0], own[1], own[2]
     for x in range(reference.shape[0]):
-        m, p = weight[x], reference[x]
-        sw[x] += m
-        sa[x] += m * p
-        saa[x] += m * p * p
+        m = weight[x]
+        p = reference[x]
+        own[0, x] += m
+        own[1, x] += m * p
+        own[2, x] += m * p * p
 
 
 @njit(**_PART)
@@ -235,7 +236,9 @@ def _add_samples(
 def _add_row(row, fy, sums):
     """Add the moments by x of a row that is ``fy`` away to the moments by x and y."""
     for x in range(row.shape[1]):
-        m, mx, r = row[0, x], row[1, x], row[3, x]
+        m = row[0, x]
+        mx = row[1, x]
+        r = row[3, x]
         sums[0, x] += m
         sums[1, x] += mx
         sums[2, x] += m * fy

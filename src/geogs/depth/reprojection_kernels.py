@@ -76,7 +76,8 @@ def agree_on_depth(depths, weights, mask, reach, clearance, penalty, best, score
     one = np.float32(1.0)
     for y in range(h):
         for x in range(w):
-            top, winner = np.float32(0.0), np.float32(0.0)
+            top = np.float32(0.0)
+            winner = np.float32(0.0)
             for j in range(n if mask[y, x] else 0):
                 d = depths[j, y, x]
                 if d <= np.float32(0.0):
@@ -90,6 +91,7 @@ def agree_on_depth(depths, weights, mask, reach, clearance, penalty, best, score
                         if e < -clearance:
                             votes -= penalty * weights[k, y, x]
                 if votes > top:
-                    top, winner = votes, d
+                    top = votes
+                    winner = d
             best[y, x] = winner
             score[y, x] = top

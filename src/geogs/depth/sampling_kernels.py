@@ -25,7 +25,8 @@ def pixel_pairs(images: np.ndarray) -> np.ndarray:
 @njit(**_PART)
 def fetch_pairs(pairs, index, top, low):
     """The pairs (h, w) at the flat indices of a row of samples, and those one row below."""
-    flat, down = pairs.ravel(), np.uint32(pairs.shape[1])
+    flat = pairs.ravel()
+    down = np.uint32(pairs.shape[1])
     for x in range(index.shape[0]):
         k = index[x]
         top[x] = flat[k]

@@ -74,21 +74,21 @@ def view_pairs(
     points = depth * np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
     poses = np.stack([other.T_cw for other in others])
     relative = poses @ np.linalg.inv(reference.T_cw)
-    rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
+    rotation = relative[:, :3, :3]
+    translation = relative[:, :3, 3]
     there = points @ np.swapaxes(rotation, 1, 2) + translation[:, None]
     z = np.maximum(there[..., 2], 1e-9)
     column = camera.fx * there[..., 0] / z + camera.cx
     row = camera.fy * there[..., 1] / z + camera.cy
     seen = (there[..., 2] > 0) & (np.abs(2 * column / (camera.width - 1) - 1) <= 1)
     seen &= np.abs(2 * row / (camera.height - 1) - 1) <= 1
-    own, theirs = np.linalg.norm(points, axis=-1), np.linalg.norm(there, axis=-1)
+    own = np.linalg.norm(points, axis=-1)
+    theirs = np.linalg.norm(there, axis=-1)
     cosine = (points @ np.swapaxes(rotation, 1, 2) * there).sum(-1) / (own * theirs + 1e-12)
     parallax = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     zoom = np.abs(np.log(np.maximum(theirs, 1e-12) / own))
-    return ViewPairs(
-        _median(parallax, seen), _angles(reference.forward, poses[:, 2, :3]),
-        seen.mean(1), np.exp(_median(zoom, seen)),
-    )  # fmt: skip
+    turned = _angles(reference.forward, poses[:, 2, :3])
+    return ViewPairs(_median(parallax, seen), turned, seen.mean(1), np.exp(_median(zoom, seen)))
 
 
 def _median(

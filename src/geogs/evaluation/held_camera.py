@@ -31,7 +31,8 @@ def look_at_one_place(T_wc: Float[np.ndarray, "k 4 4"]) -> bool:
     The point nearest to all axes must be in front of every camera and, on average, at most a
     tenth of its distance off the axis; and the cameras must be apart by at least a tenth of it.
     """
-    axes, centres = T_wc[:, :3, 2], T_wc[:, :3, 3]
+    axes = T_wc[:, :3, 2]
+    centres = T_wc[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     offset = (across @ centres[..., None])[..., 0].sum(0)
     focus = np.linalg.lstsq(across.sum(0), offset, rcond=None)[0]

@@ -7,7 +7,6 @@ import numpy as np
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.evaluation.surfaces.photoconsistency import EvaluatedPhoto
 from geogs.evaluation.surfaces.silhouettes import Silhouette
 from geogs.io.pose_files import POSE_FILES
 from geogs.io.sources.posed.posed_source import PosedSource
@@ -82,8 +81,3 @@ def silhouettes(source: PosedSource) -> list[Silhouette] | None:
             return None
         result.append(Silhouette(image.mask, source.camera, image.T_cw))
     return result
-
-
-def photographs(source: PosedSource) -> list[EvaluatedPhoto]:
-    """The images of a data set with their masks, in its unit."""
-    return [EvaluatedPhoto(image.image, image.T_cw, image.mask) for image in source]

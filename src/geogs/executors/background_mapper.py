@@ -2,25 +2,75 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from geogs.concurrent import PriorityGate
 from geogs.errors import GeogsError
-from geogs.executors.keyframe_mirror import KeyframeMirror
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.types import MapSnapshot, PoseCorrection
-from geogs.world.keyframes import KeyframeTable
+from geogs.world.keyframes import Keyframe, KeyframeTable
+
+Handover = Sequence[tuple[Keyframe, Float[Tensor, "4 4"]]]
+"""Copies of keyframes that have changed, and their poses."""
+
+
+class KeyframeMirror:
+    """A copy of a table that changes only by :meth:`update`.
+
+    Fields of keyframes are replaced, never changed in place; so a copy of references is enough.
+    """
+
+    def __init__(self, keyframes: KeyframeTable) -> None:
+        self._original = keyframes
+        self.table = keyframes.mirror()
+        """The copies, for the other thread."""
+        self._copies = self.table.new_set()
+        self._seen: dict[int, tuple[object, ...]] = {}
+        """State of each followed keyframe at the last handover."""
+
+    def follow(self, ids: Iterable[int]) -> None:
+        """Also copy these keyframes from now on."""
+        self._seen |= dict.fromkeys(ids, ())
+
+    def changed(self) -> Handover:
+        """Copy the keyframes that have changed since the last call."""
+        changed = []
+        for id, before in self._seen.items():
+            keyframe = self._original[id]
+            now = _parts(keyframe)
+            if len(before) != len(now) or any(a is not b for a, b in zip(now, before, strict=True)):
+                self._seen[id] = now
+                changed.append((keyframe.copied_to(self.table), keyframe.T_cw))
+        return changed
+
+    def update(self, changed: Handover, stream: "torch.cuda.Stream | None") -> None:
+        """Apply the changes, in the other thread, which works in a ``stream`` of a GPU."""
+        for keyframe, T_cw in changed:
+            keyframe.T_cw = T_cw
+            if keyframe.id in self._copies:
+                vars(self._copies[keyframe.id]).update(vars(keyframe))
+            else:
+                self._copies.put(keyframe)
+            for value in vars(keyframe).values():
+                if stream is not None and isinstance(value, Tensor) and value.is_cuda:
+                    value.record_stream(stream)
+
+
+def _parts(keyframe: Keyframe) -> tuple[object, ...]:
+    """Return all parts of a keyframe that are ever replaced."""
+    k = keyframe
+    return k.T_cw, k.inverse_depth, k.information, k.prior, k.scale, k.moving
+
 
 R = TypeVar("R")
 
-MAX_WAIT_SECONDS = 0.05
-"""Longest wait of mapping between two parts of its work, while a frame is tracked."""
 MAX_WAITING = 12
 """Waiting tasks above which mapping does not give way, so that it can catch up; each keyframe makes
 two tasks, and a correction one."""
@@ -39,12 +89,14 @@ class BackgroundMapper:
         self, keyframes: KeyframeTable, new_mapper: Callable[[KeyframeTable], Mapper]
     ) -> None:
         """``new_mapper`` makes a mapper for a table of keyframes."""
-        self._keyframes, self._mirror = keyframes, KeyframeMirror(keyframes)
+        self._keyframes = keyframes
+        self._mirror = KeyframeMirror(keyframes)
         device = torch.device(keyframes.grid.device)
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._mapper = new_mapper(self._mirror.table)
         self._mapper.pause = self._give_way
-        self._gate = PriorityGate(MAX_WAIT_SECONDS)
+        # Longest wait of mapping between two parts of its work, while a frame is tracked.
+        self._gate = PriorityGate(0.05)
         self._tasks: deque[Callable[[], None]] = deque()
         self._news = threading.Condition()
         self._is_closed = False
@@ -120,7 +172,8 @@ class BackgroundMapper:
     # --- the hand-over ---------------------------------------------------------------------
 
     def _tell(self, what: Callable[[Mapper], object]) -> None:
-        changed, event = self._mirror.changed(), None
+        changed = self._mirror.changed()
+        event = None
         if self._stream is not None:
             event = torch.cuda.Event()
             event.record()

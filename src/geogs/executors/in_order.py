@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.executors.background_mapper import BackgroundMapper
+from geogs.mapping.map_all import map_all
 from geogs.mapping.mapper import Mapper
 from geogs.scene_mask import SceneMask
 from geogs.stopwatch import Stopwatch
@@ -34,10 +35,12 @@ class InOrder:
     def __init__(
         self, segments: Segments, mapper: Mapper, stopwatch: Stopwatch, mask: SceneMask
     ) -> None:
-        self.segments, self.mapper = segments, mapper
+        self.segments = segments
+        self.mapper = mapper
         self.mapping: Mapper | BackgroundMapper = mapper
         """Takes keyframes and corrections: the mapper, or a thread that has one."""
-        self.stopwatch, self.mask = stopwatch, mask
+        self.stopwatch = stopwatch
+        self.mask = mask
 
     # --- a frame -----------------------------------------------------------------------------
 
@@ -116,3 +119,25 @@ class InOrder:
     def ask(self, question: Callable[[Mapper], R]) -> R:
         """Return the answer of the mapper."""
         return question(self.mapper)
+
+
+class Deferred(InOrder):
+    """In order, except the map: made from all keyframes at once, which takes less time."""
+
+    maps_at_end = True
+
+    def map(
+        self, unmapped: list[int], final: Sequence[int], lag: int, active: Sequence[int]
+    ) -> None:
+        """Leave all keyframes unmapped."""
+
+    def refine(self, unmapped: list[int], progress: Progress, seconds: float | None) -> None:
+        """Make the map from all keyframes; in limited ``seconds`` only if there is none yet."""
+        if (seconds is not None and self.disks) or not (unmapped or self.disks):
+            return
+        with self.stopwatch("final mapping"):
+            for id in unmapped:
+                if id not in self.mapper.views:  # else it was interrupted after that
+                    self.mapper.observe(id, self.mask.of(self.mapper.keyframes[id]))
+            map_all(self.mapper, [*unmapped], progress, seconds)
+        unmapped.clear()

@@ -1,5 +1,6 @@
 """Frames at once, everything else in threads; results then depend on the speed of the machine."""
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +17,7 @@ from geogs.executors.in_order import Advance, InOrder
 from geogs.mapping.mapper import Mapper
 from geogs.scene_mask import SceneMask
 from geogs.stopwatch import Stopwatch
-from geogs.threads import QuickSwitching, on_one_torch_thread
+from geogs.threads import on_one_torch_thread
 from geogs.tracking.follower import Follower
 from geogs.tracking.locate.pose_deviation import DeviationOf
 from geogs.tracking.segment_trackers import Recall, Segments
@@ -51,7 +52,9 @@ class Live(InOrder):
         self._stream = stream
         self.mapping = self._background = BackgroundMapper(mapper.keyframes, new_mapper)
         self._completion = BackgroundTask("keyframes")
-        self._switching = QuickSwitching().begin()
+        # Python's threads take turns every 5 ms, which would slow tracking several times a frame.
+        self._switch_interval = sys.getswitchinterval()
+        sys.setswitchinterval(min(0.0001, self._switch_interval))
         self._follower: Follower | None = None
 
     # --- a frame -----------------------------------------------------------------------------
@@ -65,7 +68,8 @@ class Live(InOrder):
     def track(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
         """Locate a frame; all other work on it is done in the other threads."""
         with self.stopwatch("tracking"):
-            if self._is_followed(frame):
+            follower = self._follower if self._completion.is_going_on else None
+            if follower is not None and follower.follow(frame) is not None:
                 return TrackState.TRACKING
         with self.stopwatch("waiting"):
             self.settle()
@@ -83,12 +87,6 @@ class Live(InOrder):
     def is_completing(self) -> bool:
         """Whether a keyframe is being completed."""
         return self._completion.is_going_on
-
-    def _is_followed(self, frame: Frame) -> bool:
-        """Whether a frame was located while a keyframe is being completed."""
-        if self._follower is None or not self.is_completing:
-            return False
-        return self._follower.follow(frame) is not None
 
     @on_one_torch_thread
     def _complete(self, begun: TrackResult, advance: Advance) -> None:
@@ -110,7 +108,8 @@ class Live(InOrder):
         self._completion.wait()
         if self._follower is None:
             return
-        follower, self._follower = self._follower, None
+        follower = self._follower
+        self._follower = None
         with torch.cuda.stream(self._stream):
             self.segments.tracker_of(follower.last.keyframe).take_over(follower)
         wait_for(self._stream)
@@ -119,7 +118,7 @@ class Live(InOrder):
         """End all threads; return the executor for the stages after the last frame."""
         with self.stopwatch("mapping"):
             mapper = self._background.settled()
-        self._switching.end()
+        sys.setswitchinterval(self._switch_interval)
         return InOrder(self.segments, mapper, self.stopwatch, self.mask)
 
     # --- the map -----------------------------------------------------------------------------

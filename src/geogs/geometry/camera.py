@@ -10,7 +10,6 @@ from torch import Tensor
 
 from geogs.errors import InputError
 
-_NEWTON_STEPS = 8
 LEAST_SLOPE = 0.1
 """Least slope of the distorted radius; below it the image folds over."""
 
@@ -143,7 +142,7 @@ class Camera:
         if self.is_pinhole:
             return bent
         s = radius = bent.norm(dim=-1, keepdim=True)
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(8):
             square = s.square()
             s = s - (s * self.growth(square) - radius) / self.steepness(square)
         return bent / self.growth(s.square())
@@ -164,7 +163,8 @@ class Camera:
         """Return the derivatives of :meth:`bent`: of x by x, of either by the other, of y by y."""
         x, y = plane.unbind(-1)
         square = x * x + y * y
-        growth, slope = self.growth(square), 2 * self.k1 + 4 * self.k2 * square
+        growth = self.growth(square)
+        slope = 2 * self.k1 + 4 * self.k2 * square
         return growth + slope * x * x, slope * x * y, growth + slope * y * y
 
     # --- points ----------------------------------------------------------------------------

@@ -31,12 +31,14 @@ def creased(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -
     """
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     area = np.cross(b - a, c - a)
-    facing, limit = _unit(area), np.cos(np.radians(ANGLE))
+    facing = _unit(area)
+    limit = np.cos(np.radians(ANGLE))
     means = _unit(_sums(faces.T.reshape(-1), np.tile(area, (3, 1)), len(vertices)))
     is_edge = _on_edges(faces, area, facing, means, limit)
     face, corner = np.nonzero(is_edge[faces])
     order = np.argsort(faces[face, corner], kind="stable")
-    face, corner = face[order], corner[order]
+    face = face[order]
+    corner = corner[order]
     vertex = faces[face, corner]
     normals = _means_of_alike(vertex, area[face], facing[face], limit)
     rows = np.column_stack([vertex, np.rint(_STEPS * normals).astype(np.int64)])
@@ -60,7 +62,8 @@ def _on_edges(
 ) -> Bool[np.ndarray, "n"]:
     """Whether much of the area around a vertex deviates from its mean normal."""
     size = np.linalg.norm(area, axis=1)
-    away, total = np.zeros(len(means)), np.zeros(len(means))
+    away = np.zeros(len(means))
+    total = np.zeros(len(means))
     for corner in faces.T:
         is_away = (facing * means[corner]).sum(1) < limit
         away += np.bincount(corner, size * is_away, len(means))
@@ -79,7 +82,8 @@ def _means_of_alike(
     Corners are sorted by vertex; ``area``: face normals with length area, ``facing``: unit normals.
     """
     _, start, count = np.unique(vertex, return_index=True, return_counts=True)
-    start, count = np.repeat(start, count), np.repeat(count, count)
+    start = np.repeat(start, count)
+    count = np.repeat(count, count)
     one = np.repeat(np.arange(len(vertex)), count)
     other = start[one] + np.arange(len(one)) - np.repeat(np.cumsum(count) - count, count)
     alike = (facing[one] * facing[other]).sum(1) > limit

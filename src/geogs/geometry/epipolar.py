@@ -27,7 +27,8 @@ def epipolar_distance(
         return np.linalg.norm(moved[:, :2] / moved[:, 2:] - two[:, :2], axis=1)
     cross = np.cross(np.eye(3), t / length)
     F = K_inverse.T @ -cross @ T[:3, :3] @ K_inverse
-    line_two, line_one = one @ F.T, two @ F
+    line_two = one @ F.T
+    line_one = two @ F
     value = (two * line_two).sum(axis=1)
     slope = (line_two[:, :2] ** 2).sum(axis=1) + (line_one[:, :2] ** 2).sum(axis=1)
     return np.abs(value) / np.sqrt(slope.clip(1e-24))
@@ -52,7 +53,8 @@ def in_front_of_both(
     """
     a, b = one @ T[:3, :3].T, two
     aa, bb, ab = ((x * y).sum(axis=1) for x, y in ((a, a), (b, b), (a, b)))
-    at, bt = a @ T[:3, 3], b @ T[:3, 3]
+    at = a @ T[:3, 3]
+    bt = b @ T[:3, 3]
     in_front = (ab * bt > bb * at) & (aa * bt > ab * at)
     return in_front | (ab > np.cos(parallel) * np.sqrt(aa * bb))
 

@@ -34,7 +34,8 @@ def depth_jumps(depth: Float[Tensor, "h w"]) -> DepthJumps:
     end no jump.
     """
     inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), torch.nan)
-    across, down = _ends(inverse), DepthJumps(*(ends.mT for ends in _ends(inverse.mT)))
+    across = _ends(inverse)
+    down = DepthJumps(*(ends.mT for ends in _ends(inverse.mT)))
     return DepthJumps(across.near | down.near, across.far | down.far)
 
 
@@ -45,7 +46,8 @@ def _ends(inverse: Float[Tensor, "h w"]) -> DepthJumps:
     after = F.pad(step[:, 1:], (0, 1), value=torch.inf)
     left = torch.minimum(torch.minimum((step - before).abs(), (step - after).abs()), step.abs())
     jump = left > JUMP * torch.maximum(inverse[:, 1:], inverse[:, :-1])
-    rises, falls = jump & (step > 0), jump & (step < 0)
+    rises = jump & (step > 0)
+    falls = jump & (step < 0)
     return DepthJumps(
         F.pad(rises, (1, 0)) | F.pad(falls, (0, 1)), F.pad(rises, (0, 1)) | F.pad(falls, (1, 0))
     )

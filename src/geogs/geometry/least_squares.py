@@ -97,7 +97,8 @@ def minimise(
             that lower it are accepted (Levenberg-Marquardt): damping falls tenfold with each of
             these and rises tenfold with each other. Without one all steps are accepted.
     """
-    state, damping = start, policy.damping
+    state = start
+    damping = policy.damping
     linear: L | None = None
     before = after = math.nan
     steps = trials = 0
@@ -119,7 +120,9 @@ def minimise(
         if found is None or (cost is not None and not after < before):
             damping = max(damping, policy.least_raised) * 10
             continue
-        state, linear, steps = found.state, None, steps + 1
+        state = found.state
+        linear = None
+        steps = steps + 1
         is_last = found.size < policy.tolerance
         if cost is None:
             if is_last:

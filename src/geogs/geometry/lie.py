@@ -5,21 +5,81 @@ are ``[tau(3), phi(3)(, sigma(1))]``. Every function is differentiable everywher
 and the logarithms are valid up to (not at) a half turn.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from geogs.geometry.sim3_translation import TranslationMap, halvings_of
+Numbers = tuple[Tensor, Tensor, Tensor]
+"""Factors of I, K and K^2."""
 
-# Size of a tangent's adjoint up to which eight terms of the series are exact to all digits.
-_NEAR_ZERO = 0.25
-# Below this squared angle the closed forms lose digits and a Taylor series takes over.
-_SMALL = {torch.float64: 1e-4, torch.float32: 1e-3}
+
+class TranslationMap:
+    """V with translation = V tau: the integral of exp(s (sigma I + K)) over s in [0, 1], K the
+    cross product with phi.
+
+    As K^3 = -theta^2 K, all such matrices are a I + b K + c K^2, stored as three numbers each.
+    """
+
+    def __init__(self, phi: Float[Tensor, "*b 3"], sigma: Float[Tensor, "*b"]) -> None:
+        self._phi = phi
+        self._square = phi.square().sum(-1)
+        halvings = halvings_of((self._square.sqrt() + sigma.abs()).detach())
+        zero = torch.zeros_like(sigma)
+        one = torch.ones_like(sigma)
+        h: Numbers = (sigma / 2**halvings, one / 2**halvings, zero)
+        term: Numbers = (one, zero, zero)
+        v: Numbers = (one, zero, zero)
+        for k in range(2, 13):
+            a, b, c = self._product(term, h)
+            term = a / k, b / k, c / k
+            v = v[0] + term[0], v[1] + term[1], v[2] + term[2]
+        a, b, c = self._product(h, v)
+        e: Numbers = (a + 1, b, c)
+        for _ in range(halvings):
+            a, b, c = self._product((e[0] + 1, e[1], e[2]), v)
+            v = (a / 2, b / 2, c / 2)
+            e = self._product(e, e)
+        self._v = v
+
+    def __matmul__(self, tau: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Return V tau."""
+        return self._apply(self._v, tau)
+
+    def solve(self, t: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Return V^-1 t."""
+        a, b, c = self._v
+        p = a - self._square * c
+        determinant = p.square() + self._square * b.square()
+        inverse = 1 / a, -b / determinant, (b.square() - c * p) / (a * determinant)
+        return self._apply(inverse, t)
+
+    def _product(self, x: Numbers, y: Numbers) -> Numbers:
+        (a, b, c), (d, e, f) = x, y
+        return (
+            a * d,
+            a * e + b * d - self._square * (b * f + c * e),
+            a * f + c * d + b * e - self._square * (c * f),
+        )
+
+    def _apply(self, x: Numbers, tau: Tensor) -> Tensor:
+        a, b, c = (k[..., None] for k in x)
+        once = torch.linalg.cross(*torch.broadcast_tensors(self._phi, tau))
+        twice = torch.linalg.cross(*torch.broadcast_tensors(self._phi, once))
+        return a * tau + b * once + c * twice
+
+
+def halvings_of(size: Tensor) -> int:
+    """Return how often matrices of these sizes are halved before summing their series."""
+    most = float(size.max()) if size.numel() else 0.0
+    return max(0, math.ceil(math.log2(most / 0.5))) if 0.5 < most < math.inf else 0
 
 
 def _is_small(x2: Tensor) -> Tensor:
-    return x2 < _SMALL.get(x2.dtype, 1e-3)
+    """Whether the closed forms lose digits at a squared angle, where a Taylor series takes over."""
+    return x2 < (1e-4 if x2.dtype is torch.float64 else 1e-3)
 
 
 def so3_hat(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -77,7 +137,7 @@ def _compose(linear: Tensor, translation: Tensor) -> Tensor:
 
 def se3_exp(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
     """Exponential map of SE(3); ``xi = [tau, phi]``."""
-    tau, phi = xi[..., :3], xi[..., 3:]
+    tau, phi = xi.split(3, -1)
     return _compose(so3_exp(phi), (_left_jacobian(phi) @ tau[..., None])[..., 0])
 
 
@@ -117,7 +177,8 @@ def _integral_of_exponential(M: Tensor) -> Tensor:
     eye = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
     halvings = halvings_of(M.detach().abs().sum(-1))
     h = M / 2**halvings
-    term, v = eye.expand_as(M), eye.expand_as(M)
+    term = eye.expand_as(M)
+    v = eye.expand_as(M)
     for k in range(2, 13):
         term = term @ h / k
         v = v + term
@@ -131,9 +192,9 @@ def _integral_of_exponential(M: Tensor) -> Tensor:
 
 def sim3_exp(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 4 4"]:
     """Exponential map of Sim(3), ``xi = [tau, phi, sigma]``; the linear part is ``e^sigma R``."""
-    tau, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]
-    linear = sigma.exp()[..., None, None] * so3_exp(phi)
-    return _compose(linear, TranslationMap(phi, sigma) @ tau)
+    tau, phi, sigma = xi.split([3, 3, 1], -1)
+    linear = sigma.exp()[..., None] * so3_exp(phi)
+    return _compose(linear, TranslationMap(phi, sigma[..., 0]) @ tau)
 
 
 def sim3_scale(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
@@ -144,7 +205,8 @@ def sim3_scale(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
 def sim3_log(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7"]:
     """Logarithm of Sim(3), the inverse of :func:`sim3_exp` for angles below pi."""
     s = sim3_scale(S)
-    phi, sigma = so3_log(S[..., :3, :3] / s[..., None, None]), s.log()
+    phi = so3_log(S[..., :3, :3] / s[..., None, None])
+    sigma = s.log()
     tau = TranslationMap(phi, sigma).solve(S[..., :3, 3])
     return torch.cat([tau, phi, sigma[..., None]], -1)
 
@@ -166,10 +228,10 @@ def sim3_adjoint(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7 7"]:
 
 def sim3_small_adjoint(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
     """``ad`` with ``Exp(ad(xi)) = Ad(Exp(xi))``: the bracket of Sim(3) as a matrix."""
-    tau, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6, None, None]
+    tau, phi, sigma = xi.split([3, 3, 1], -1)
     turn = so3_hat(phi)
     eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
-    top = torch.cat([sigma * eye + turn, so3_hat(tau), -tau[..., None]], -1)
+    top = torch.cat([sigma[..., None] * eye + turn, so3_hat(tau), -tau[..., None]], -1)
     return pad(torch.cat([top, pad(turn, (3, 1))], -2), (0, 0, 0, 1))
 
 
@@ -187,7 +249,8 @@ def sim3_inverse_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
     Near zero, where most errors are, by its own series with Bernoulli numbers: a third of the work.
     """
     ad = sim3_small_adjoint(xi)
-    far = ad.detach().abs().sum(-1).amax(-1) > _NEAR_ZERO
+    # Up to this size of the adjoint eight terms of the series are exact to all digits.
+    far = ad.detach().abs().sum(-1).amax(-1) > 0.25
     second = ad @ ad
     fourth = second @ second
     series = second / 12 - fourth / 720 + (second / 30240 - fourth / 1209600) @ fourth
@@ -230,10 +293,16 @@ def quaternion_to_matrix(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation of a quaternion ``w, x, y, z`` of any non-zero norm."""
     w, x, y, z = (q / q.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
@@ -242,11 +311,15 @@ def matrix_to_quaternion(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     m = R.flatten(-2).unbind(-1)
     # Each row is 4 q_k (w, x, y, z) for one pivot k.
     z, y, x = m[7] - m[5], m[2] - m[6], m[3] - m[1]
-    p, s, t = m[1] + m[3], m[2] + m[6], m[5] + m[7]
+    p = m[1] + m[3]
+    s = m[2] + m[6]
+    t = m[5] + m[7]
     diagonal = [
-        1 + m[0] + m[4] + m[8], 1 + m[0] - m[4] - m[8],
-        1 - m[0] + m[4] - m[8], 1 - m[0] - m[4] + m[8],
-    ]  # fmt: skip
+        1 + m[0] + m[4] + m[8],
+        1 + m[0] - m[4] - m[8],
+        1 - m[0] + m[4] - m[8],
+        1 - m[0] - m[4] + m[8],
+    ]
     rows = torch.stack(
         [
             torch.stack([diagonal[0], z, y, x], -1),

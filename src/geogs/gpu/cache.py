@@ -43,12 +43,13 @@ def read_cubin(key: str) -> bytes | None:
         content = _path(key).read_bytes()
     except OSError:
         return None
-    checksum, cubin = content[:32], content[32:]
+    checksum = content[:32]
+    cubin = content[32:]
     return cubin if hashlib.sha256(cubin).digest() == checksum else None
 
 
-def write_cubin(key: str, cubin: bytes) -> bool:
-    """Store a cubin atomically, even if others write it, too. False if it cannot be written."""
+def write_cubin(key: str, cubin: bytes) -> None:
+    """Store a cubin atomically, even if others write it, too; warn if it cannot be written."""
     path = _path(key)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,8 +64,6 @@ def write_cubin(key: str, cubin: bytes) -> bool:
             path.parent,
             error.strerror or error,
         )
-        return False
-    return True
 
 
 def cache_state() -> CacheState:

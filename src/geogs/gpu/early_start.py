@@ -43,6 +43,7 @@ def _make_ready(index: int) -> None:
     """Make the context that PyTorch is going to use, without holding the interpreter lock."""
     with contextlib.suppress(OSError, AttributeError):
         cuda = ctypes.CDLL("libcuda.so.1")
-        device, context = ctypes.c_int(), ctypes.c_void_p()
+        device = ctypes.c_int()
+        context = ctypes.c_void_p()
         if not (cuda.cuInit(0) or cuda.cuDeviceGet(ctypes.byref(device), index)):
             cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)

@@ -48,7 +48,8 @@ def gpu_problem() -> str | None:
         available = torch.version.cuda is not None and torch.cuda.is_available()
     if available:
         return None
-    supported, built = driver_cuda(), torch.version.cuda
+    supported = driver_cuda()
+    built = torch.version.cuda
     has_driver = supported is not None or _KERNEL_MODULE.exists()
     if not has_driver:
         build = "" if built else " and a CUDA build of PyTorch"

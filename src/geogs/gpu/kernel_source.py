@@ -1,7 +1,6 @@
 """Kernel sources: their files, their includes and the kernels that they define."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
@@ -16,14 +15,6 @@ _KERNEL = re.compile(
     re.DOTALL,
 )
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"', re.MULTILINE)
-
-
-@dataclass(frozen=True)
-class KernelSignature:
-    """A kernel's name and the types of its parameters, as ``float*``, ``int``, ``float``, ..."""
-
-    name: str
-    parameters: tuple[str, ...]
 
 
 def kernel_sources(folder: Path) -> list[Path]:
@@ -50,14 +41,14 @@ def read_source(path: Path) -> str:
     return insert(path.read_text(), path.parent)
 
 
-def kernel_signatures(source: str) -> dict[str, KernelSignature]:
-    """The ``extern "C" __global__`` functions of a source."""
+def kernel_signatures(source: str) -> dict[str, tuple[str, ...]]:
+    """The ``extern "C" __global__`` functions of a source, each with the types of its parameters,
+    as ``float*``, ``int``, ``float``, ..."""
     plain = re.sub(r"//[^\n]*|/\*.*?\*/", "", source, flags=re.DOTALL)
-    found = {}
-    for name, text in _KERNEL.findall(plain):
-        types = tuple(_parameter_type(p) for p in text.split(",") if p.strip())
-        found[name] = KernelSignature(name, types)
-    return found
+    return {
+        name: tuple(_parameter_type(p) for p in parameters.split(",") if p.strip())
+        for name, parameters in _KERNEL.findall(plain)
+    }
 
 
 def _parameter_type(declaration: str) -> str:

@@ -20,7 +20,8 @@ class Nvrtc:
         self.path = path
         """Path as opened; a bare name was found by the system's loader."""
         self._library = library
-        major, minor = ctypes.c_int(), ctypes.c_int()
+        major = ctypes.c_int()
+        minor = ctypes.c_int()
         self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
         self.version = f"{major.value}.{minor.value}"
 
@@ -29,7 +30,8 @@ class Nvrtc:
 
         Raises DeviceError with the compiler's message if it has errors.
         """
-        rtc, program = self._library, ctypes.c_void_p()
+        rtc = self._library
+        program = ctypes.c_void_p()
         self._check(
             rtc.nvrtcCreateProgram(
                 ctypes.byref(program), source.encode(), name.encode(), 0, None, None

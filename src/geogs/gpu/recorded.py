@@ -23,7 +23,8 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
     recording with an error. A recording that fails leaves the device's random generator in
     recording mode: it goes on with a copy of its state.
     """
-    graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
+    graph = torch.cuda.CUDAGraph()
+    collects = gc.isenabled()
     gc.disable()
     try:
         with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
@@ -48,7 +49,8 @@ class Recorded:
 
     def __init__(self, work: Callable[..., Maps], name: str) -> None:
         """``name`` is used in the warning if it cannot be recorded."""
-        self._work, self._name = work, name
+        self._work = work
+        self._name = name
         self._done_once = set[tuple[torch.Size, ...]]()
         self._recordings: dict[tuple[torch.Size, ...], Callable[..., Maps]] = {}
         self._lock = threading.Lock()

@@ -24,11 +24,15 @@ LARGEST_PICTURE = 1 << 31
 """Largest file in bytes."""
 _PIXELS_A_BYTE = 10_000
 """Pixels per byte of an all-black picture, compressed as well as any format can."""
-_ORIENTATION, _QUARTER_TURNED = 0x0112, (5, 6, 7, 8)
-"""Entry of the EXIF, and its values for which width and height are exchanged."""
+_ORIENTATION, _QUARTER_TURNS = 0x0112, {3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}
+"""Entry of the EXIF, and the clockwise quarter turns to the upright picture by its value."""
+_TIFF = {b"II*\0": "little", b"MM\0*": "big"}
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _HARMLESS = 1 << 24
 """Number of pixels, or bytes, that is always quick to decode."""
 _PNG = b"\x89PNG\r\n\x1a\n"
+DEEP = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+"""Flags of ``cv2.imdecode`` for colour of any number of bits, see ``tones.py``."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,13 @@ def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
     """Decode the bytes of such a file."""
     if not len(data) or _claims_too_many_pixels(data) or _has_oversized_chunk(data):
         return Decoded(None)
+    if flags & cv2.IMREAD_IGNORE_ORIENTATION:
+        data = _without_turn(data)
     picture, noise = _decode(data, flags, alone=False)
     if noise:  # of this one, or of one that another thread decodes
         picture, noise = _decode(data, flags, alone=True)
+    if picture is None and flags & DEEP == DEEP and data[:4].tobytes() in _TIFF:
+        picture = _in_colour(_decode(data, cv2.IMREAD_UNCHANGED, alone=False)[0])
     is_damaged = any("corrupt" in line.lower() for line in noise) or _is_cut_off(data)
     return Decoded(picture, picture is not None and is_damaged)
 
@@ -76,6 +84,13 @@ def _decode(data: np.ndarray, flags: int, alone: bool) -> tuple[np.ndarray | Non
     return picture, noise
 
 
+def _in_colour(picture: np.ndarray | None) -> np.ndarray | None:
+    """A picture of any type of values with three channels."""
+    if picture is None:
+        return None
+    return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture[..., :3]
+
+
 def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
     """Width and height as stored, and Pillow's mode; none where there is no picture.
 
@@ -86,7 +101,7 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
 
     try:
         with header_read(path) as picture:
-            return picture.size, picture.mode
+            return size_and_turns(picture)[0], picture.mode
     except Image.DecompressionBombError:
         raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
     except Exception:  # a damaged file may raise any exception
@@ -95,12 +110,27 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
 
 def upright_size(path: Path) -> tuple[int, int] | None:
     """Width and height of the :func:`decoded` picture; none where there is no picture."""
+    size, turns = stored_size_and_turns(path)
+    return size[::-1] if size and turns % 2 else size
+
+
+def stored_size_and_turns(path: Path) -> tuple[tuple[int, int] | None, int]:
+    """The :func:`size_and_turns` of a file; none and 0 where there is no picture."""
     try:
         with header_read(path) as picture:
-            is_turned = picture.getexif().get(_ORIENTATION) in _QUARTER_TURNED
-            return picture.size[::-1] if is_turned else picture.size
+            return size_and_turns(picture)
     except Exception:  # a damaged file may raise any exception
-        return None
+        return None, 0
+
+
+def size_and_turns(picture: Any) -> tuple[tuple[int, int], int]:
+    """Width and height of Pillow's picture as stored, and the clockwise quarter turns by which its
+    EXIF makes it upright."""
+    size: tuple[int, int] = picture.size
+    if picture.format == "TIFF":  # of which Pillow tells the size upright
+        size = picture.tag_v2[_TIFF_WIDTH], picture.tag_v2[_TIFF_HEIGHT]
+    is_told = picture.format != "PNG" or "exif" in picture.info  # else Pillow decodes all of it
+    return size, _QUARTER_TURNS.get(picture.getexif().get(_ORIENTATION), 0) if is_told else 0
 
 
 @contextmanager
@@ -124,11 +154,9 @@ def _claims_too_many_pixels(data: np.ndarray) -> bool:
     """Whether a header claims more pixels than so few bytes can hold."""
     from PIL import Image
 
+    warnings_ignored = warnings.catch_warnings(action="ignore")
     try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(data.tobytes())) as picture,
-        ):
+        with warnings_ignored, Image.open(io.BytesIO(data.tobytes())) as picture:
             pixels = picture.width * picture.height
     except Image.DecompressionBombError:
         pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)
@@ -137,10 +165,26 @@ def _claims_too_many_pixels(data: np.ndarray) -> bool:
     return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
 
 
+def _without_turn(data: np.ndarray) -> np.ndarray:
+    """The bytes of a TIFF with the orientation 1, as OpenCV turns it whatever its flags; those of
+    another picture unchanged."""
+    order: Any = _TIFF.get(data[:4].tobytes())
+    if order is None:
+        return data
+    at = int.from_bytes(data[4:8], order)
+    end = at + 2 + 12 * int.from_bytes(data[at : at + 2], order)
+    for entry in range(at + 2, min(end, len(data) - 11), 12):  # it may be cut off
+        if int.from_bytes(data[entry : entry + 2], order) == _ORIENTATION:
+            data = data.copy()
+            data[entry + 8 : entry + 10] = np.frombuffer((1).to_bytes(2, order), np.uint8)
+    return data
+
+
 def _has_oversized_chunk(data: np.ndarray) -> bool:
     """Whether a chunk of a PNG claims to be far longer than the file, for which OpenCV would
     allocate up to 4 GiB."""
-    file, at = data.data, len(_PNG)
+    file = data.data
+    at = len(_PNG)
     if file[:at] != _PNG:
         return False
     while at + 4 <= len(file):

@@ -24,8 +24,10 @@ _KINDS = {
 }  # fmt: skip
 _Order = Literal["<", ">"]
 _ORDERS: dict[str, _Order | None] = {
-    "ascii": None, "binary_little_endian": "<", "binary_big_endian": ">",
-}  # fmt: skip
+    "ascii": None,
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
+}
 LARGEST_PLY = 1 << 35
 """Largest file in bytes."""
 
@@ -87,7 +89,8 @@ def read_ply(path: str | Path) -> dict[str, PlyElement]:
         data = read_bytes(path, LARGEST_PLY)
         text, layout, start = _header(data)
         if text:
-            data, start = _numbers(data[start:]).tobytes(), 0
+            data = _numbers(data[start:]).tobytes()
+            start = 0
         elements = {}
         for name, (count, properties) in layout.items():
             elements[name], start = _element(data, start, name, count, properties)
@@ -152,7 +155,8 @@ def _element(
     if count * smallest > len(data) - start:
         raise _WrongPly(f"it is cut off: {count} rows of {name} are not there")
     values, lengths, end = _rows(data, start, count, properties)
-    columns, lists = {}, {}
+    columns = {}
+    lists = {}
     for p, stored, length in zip(properties, values, lengths.T, strict=True):
         if p.stored_length is None:
             columns[p.name] = _declared(stored, p)

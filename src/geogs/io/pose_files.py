@@ -41,7 +41,9 @@ def read_tum_trajectory(path: Path) -> Trajectory:
         InputError: the file is missing, empty, not of eight columns, or its quaternions are not.
     """
     rows = read_rows(path, columns=(8,), layout="t tx ty tz qx qy qz qw")
-    seconds, position, xyzw = rows[:, 0], rows[:, 1:4], rows[:, 4:]
+    seconds = rows[:, 0]
+    position = rows[:, 1:4]
+    xyzw = rows[:, 4:]
     _check_quaternions(path, rows, _has_pose(np.column_stack([seconds, position]), xyzw))
     return quaternion_trajectory(path, seconds, position, xyzw)
 
@@ -81,12 +83,15 @@ def read_frame_poses(folder: Path) -> Trajectory:
     if (folder / ORIENTATIONS).is_file():
         files = [file for file in (*files, folder / ORIENTATIONS) if _has_rows(file)] or files
     parts = [read_tum_trajectory(file) for file in files]
-    only = np.concatenate([
-        np.full(len(part.timestamps), file.name == ORIENTATIONS)
-        for part, file in zip(parts, files, strict=True)
-    ])  # fmt: skip
+    only = np.concatenate(
+        [
+            np.full(len(part.timestamps), file.name == ORIENTATIONS)
+            for part, file in zip(parts, files, strict=True)
+        ]
+    )
     times = np.concatenate([part.timestamps for part in parts])
-    order, T_wc = times.argsort(kind="stable"), np.concatenate([part.T_wc for part in parts])
+    order = times.argsort(kind="stable")
+    T_wc = np.concatenate([part.T_wc for part in parts])
     return Trajectory(times[order], T_wc[order], ~only[order], only[order])
 
 

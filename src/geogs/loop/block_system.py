@@ -50,7 +50,8 @@ class BlockSystem:
         rows = torch.cat([place[row[self._inside]], torch.arange(count)])
         columns = torch.cat([place[column[self._inside]], torch.arange(count)])
         keys, at = torch.unique(columns * count + rows, return_inverse=True)
-        self._at, self._blocks = at[: len(self._inside)], len(keys)
+        self._at = at[: len(self._inside)]
+        self._blocks = len(keys)
         self._diagonal_blocks = at[len(self._inside) :]
         within = np.arange(BLOCK)
         first, left = (BLOCK * k.numpy()[:, None, None] for k in (keys % count, keys // count))
@@ -88,9 +89,11 @@ class BlockSystem:
         try:
             # Symmetric and positive definite: pivots stay on the diagonal.
             factor = splu(
-                self._matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0,
+                self._matrix,
+                permc_spec="NATURAL",
+                diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
-            )  # fmt: skip
+            )
         except RuntimeError:
             return None
         solution = factor.solve(right.reshape(-1).numpy())

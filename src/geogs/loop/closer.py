@@ -139,14 +139,17 @@ class LoopCloser:
     def _settled(self, fresh: Sequence[int]) -> list[Pair]:
         """Return pairs near which newly final keyframes need no search."""
         tracker = self.segments.tracker_of(fresh[0]) if fresh else self.segments.main
-        known, edges = self._of(tracker), tracker.map.graph.edges
+        known = self._of(tracker)
+        edges = tracker.map.graph.edges
         relative = joined([known.odometry, known.loops])
-        min_gap, min_change = self.config.min_gap, self.config.min_change
+        min_gap = self.config.min_gap
+        min_change = self.config.min_change
         return settled_pairs(tracker.keyframes, relative, edges, min_gap, min_change)
 
     def _of(self, tracker: Tracker) -> SegmentConstraints:
         """Return the relative poses of a segment."""
-        known, number = self.table.constraints, tracker.segment.number
+        known = self.table.constraints
+        number = tracker.segment.number
         if number not in known:
             fixed = sorted(tracker.segment.fixed)
             known[number] = SegmentConstraints(of_poses(tracker.keyframes, fixed))
@@ -167,13 +170,13 @@ class LoopCloser:
         if first is not second:
             self.table.between.append(loop)
             return
-        known, constraint = self._of(first), self._constraint(loop)
+        known = self._of(first)
+        constraint = self._constraint(loop)
+        if not len(constraint):
+            return
         known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
-        ends = sorted({loop.first, loop.second})
-        poses, placed = first.keyframes.poses(ends), between_positions(constraint, ends)
-        depth = first.keyframes.median_depths(ends)
-        differs = differences(poses, placed, depth) >= self.config.min_change
-        errors = squared_errors(poses, placed)
+        differs = differences(first.keyframes, constraint) >= self.config.min_change
+        errors = squared_errors(first.keyframes, constraint)
         known.pending += bool((differs & (errors > self.config.residual)).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
@@ -203,7 +206,8 @@ class LoopCloser:
     def _ends(self, loop: Loop) -> tuple[Tracker, Tracker]:
         """Return host and guest: the main map is host, else the earlier segment."""
         a, b = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
-        world, is_earlier = self.segments.main, b.keyframes.ids < a.keyframes.ids
+        world = self.segments.main
+        is_earlier = b.keyframes.ids < a.keyframes.ids
         if b is world or (a is not world and is_earlier):
             return b, a
         return a, b
@@ -217,7 +221,9 @@ class LoopCloser:
             S[:3, :3] /= sim3_scale(S)
         here, there = loop.first, loop.second
         if loop.first in guest.keyframes:
-            S, here, there = sim3_inverse(S), loop.second, loop.first
+            S = sim3_inverse(S)
+            here = loop.second
+            there = loop.first
         return se3_inverse(guest.keyframes[there].T_cw) @ S @ host.keyframes[here].T_cw
 
     def _agrees(self, loop: Loop, S: Float[Tensor, "4 4"]) -> bool:
@@ -243,9 +249,10 @@ class LoopCloser:
         ours.pending += 1
         final = self.segments.join(host, guest, S)
         self.table.between = [
-            o for o in self.table.between
+            o
+            for o in self.table.between
             if self.segments.tracker_of(o.first) is not self.segments.tracker_of(o.second)
-        ]  # fmt: skip
+        ]
         return final if host is self.segments.main else ()
 
     # --- closing loops ---------------------------------------------------------------------
@@ -253,13 +260,15 @@ class LoopCloser:
     def _close(self, is_last: bool) -> None:
         """Correct the main map by its loops, if new ones change it."""
         world = self.segments.main
-        known, ids = self._of(world), world.keyframes.ids
+        known = self._of(world)
+        ids = world.keyframes.ids
         # The cost of a correction is proportional to the keyframes, and so is its interval.
         pause = max(self.config.close_every, len(ids) // 10)
         due = is_last or len(ids) - known.last_attempt >= pause
         if not known.pending or not due or self._asked is not None:
             return
-        known.pending, known.last_attempt = 0, len(ids)
+        known.pending = 0
+        known.last_attempt = len(ids)
         question = self._question(known)
         if question is None:
             return
@@ -272,8 +281,10 @@ class LoopCloser:
     def _question(self, known: SegmentConstraints) -> ClosingQuestion | None:
         """Return the input of a closing of the main map's loops; None where hardly anything
         matches: then the drift is unknown."""
-        world, config = self.segments.main, self.config
-        keyframes, edges = world.keyframes, world.map.graph.edges
+        world = self.segments.main
+        config = self.config
+        keyframes = world.keyframes
+        edges = world.map.graph.edges
         ids = keyframes.ids
         relative = joined([known.odometry, of_edges(keyframes, edges), known.loops])
         relative = between_positions(relative, ids)
@@ -295,9 +306,11 @@ class LoopCloser:
 
     def _take_answer(self) -> None:
         """Apply the closing of the thread, or request another if the main map has changed since."""
-        asked, self._asked = self._asked, None
+        asked = self._asked
+        self._asked = None
         assert asked is not None
-        closure, world = asked.answer.result(), self.segments.main
+        closure = asked.answer.result()
+        world = self.segments.main
         if asked.world is world and asked.age == self._age:
             self._correct(asked.question, closure)
         else:
@@ -327,7 +340,8 @@ class LoopCloser:
 
     def _change(self, correction: PoseCorrection) -> float:
         """Return the largest change of a keyframe by a correction."""
-        keyframes, ids = self.segments.main.keyframes, sorted(correction.before)
+        keyframes = self.segments.main.keyframes
+        ids = sorted(correction.before)
         scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
         S = torch.stack([correction.after[k] for k in ids])
         S[:, :3] *= scale[:, None, None]

@@ -76,7 +76,8 @@ def dense_check(
     there, back = locator.locate_both_ways(first, second, T_second, T_first)
     if there is None or back is None:
         return DenseCheck(False, "the flow agrees with no pose")
-    matched, residual = min(there.matched, back.matched), max(there.residual, back.residual)
+    matched = min(there.matched, back.matched)
+    residual = max(there.residual, back.residual)
     T_there = there.T_cw @ se3_inverse(first.T_cw)
     T_back = back.T_cw @ se3_inverse(second.T_cw)
     ratios = _depth_ratios(grid, first, second, there, T_there)
@@ -103,9 +104,16 @@ def dense_check(
     else:
         reason = ""
     return DenseCheck(
-        not reason, reason, T_there, scale_dense, matched, residual, contradiction,
-        there.match, back.match,
-    )  # fmt: skip
+        not reason,
+        reason,
+        T_there,
+        scale_dense,
+        matched,
+        residual,
+        contradiction,
+        there.match,
+        back.match,
+    )
 
 
 def _depth_ratios(

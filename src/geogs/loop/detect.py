@@ -72,9 +72,10 @@ class LoopDetector:
         # The search reads data written in the stream in which the detector was made.
         stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
         self._thread = ThreadPoolExecutor(
-            max_workers=1, thread_name_prefix="loops",
+            max_workers=1,
+            thread_name_prefix="loops",
             initializer=lambda: None if stream is None else torch.cuda.set_stream(stream),
-        )  # fmt: skip
+        )
         self.table = table or LoopTable()
         self._order = {id: rank for rank, id in enumerate(self.table.keyframes)}
         """Rank in time of each keyframe searched so far."""
@@ -120,7 +121,8 @@ class LoopDetector:
 
     def candidates(self, id: int) -> list[int]:
         """Return keyframes that an added one revisits by the present poses, nearest first."""
-        facing, segment = self._facing(id), self.keyframes.set_of[id]
+        facing = self._facing(id)
+        segment = self.keyframes.set_of[id]
         if not facing:
             return []
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
@@ -130,7 +132,8 @@ class LoopDetector:
         return [facing[n] for n in order[distance < limit].tolist()]
 
     def _query(self, id: int, settled: Sequence[Pair]) -> Query:
-        near, by_pose = self._near(id), tuple(self.candidates(id))
+        near = self._near(id)
+        by_pose = tuple(self.candidates(id))
         known = tuple(self._found_near(id))
         features = self._search.describe(self.keyframes[id].image)
         return Query(id, features, near, by_pose, known, tuple(settled), self._depths())
@@ -147,7 +150,8 @@ class LoopDetector:
     def _found_near(self, id: int) -> list[Pair]:
         """Return the pairs of loops whose later keyframe is near enough to this one to suppress its
         candidates; loops are ordered by their later keyframes."""
-        rank, loops = self._order[id], self.table.loops
+        rank = self._order[id]
+        loops = self.table.loops
         first = bisect_left(loops, rank - SUPPRESSION, key=self._later_rank)
         last = bisect_right(loops, rank + SUPPRESSION, key=self._later_rank)
         return [(loop.first, loop.second) for loop in loops[first:last]]
@@ -164,7 +168,8 @@ class LoopDetector:
 
     def _near(self, id: int) -> frozenset[int]:
         """Return the keyframe itself and those near it in time in the same segment."""
-        segment, recent = self.keyframes.set_of[id], self.table.keyframes[self._first_near(id) :]
+        segment = self.keyframes.set_of[id]
+        recent = self.table.keyframes[self._first_near(id) :]
         return frozenset(k for k in recent if k in segment)
 
     def _first_near(self, id: int) -> int:
@@ -212,12 +217,19 @@ class LoopDetector:
         The initial pose is that of the features, or the present one where they failed: plain
         surfaces have few corners, but when the drift is small the flow needs none.
         """
-        p, view = verified.candidate, verified.view
-        first, second, grid = self.keyframes[p.first], self.keyframes[p.second], self.grid
+        p = verified.candidate
+        view = verified.view
+        first = self.keyframes[p.first]
+        second = self.keyframes[p.second]
+        grid = self.grid
         if view.accepted and view.is_metric and view.T_ji is not None:
-            T, scale, inliers = view.T_ji, view.scale or 1.0, view.inliers
+            T = view.T_ji
+            scale = view.scale or 1.0
+            inliers = view.inliers
         elif p.cause == "geometry":
-            T, scale, inliers = second.T_cw @ se3_inverse(first.T_cw), 1.0, 0
+            T = second.T_cw @ se3_inverse(first.T_cw)
+            scale = 1.0
+            inliers = 0
         else:
             return None
         check = dense_check(grid, self.operator, first, second, T, scale)
@@ -226,9 +238,16 @@ class LoopDetector:
         if not check.accepted or check.T_ji is None:
             return None
         return Loop(
-            p.first, p.second, p.cause, check.T_ji, check.scale, inliers, check.matched,
-            check.there, check.back,
-        )  # fmt: skip
+            p.first,
+            p.second,
+            p.cause,
+            check.T_ji,
+            check.scale,
+            inliers,
+            check.matched,
+            check.there,
+            check.back,
+        )
 
 
 def _finish(search: Future[None] | None) -> None:

@@ -1,10 +1,20 @@
 """Bundle adjustment over all keyframes, with flow measured again in every round."""
 
-from geogs.loop.camera.adjustment import adjust_camera
+import math
+from dataclasses import replace
+
+import torch
+
+from geogs.camera.straight_view import FrameViews, StraightView
+from geogs.loop.camera.frame_lenses import correct_frame_lenses
+from geogs.loop.camera.lens import correct_lens, found_lens
+from geogs.loop.camera.rows import correct_rows, let_lenses_move
 from geogs.loop.keyframe_matches import STAGE, KeyframeMatches
 from geogs.stopwatch import StageProgress, unwatched
+from geogs.threads import ordered_map, worker_count
 from geogs.tracking.tracker import Tracker
-from geogs.types import PoseCorrection
+from geogs.types import FrameLens, PoseCorrection
+from geogs.world.keyframes import KeyframeSet
 
 PRIORS_TOGETHER = 32
 """Keyframes whose depths are adjusted with their priors at a time; bounds memory."""
@@ -19,10 +29,11 @@ def global_bundle(
     and information of the tracker are updated, and its graph only has the fresh edges; further
     tracking only needs those that ``FrameGraph.retire`` keeps. Returns the poses before and after;
     scales are 1. Where it ``ends`` the tracking, images are straightened by the camera estimated
-    from the matches (:func:`~geogs.loop.camera.adjustment.adjust_camera`). A tracker without a map,
+    from the matches (:func:`~geogs.loop.global_bundle.adjust_camera`). A tracker without a map,
     or with straightened images, is not changed.
     """
-    store, ids = tracker.keyframes, tracker.segment.ids
+    store = tracker.keyframes
+    ids = tracker.segment.ids
     if not ids or store.table.lens is not None:
         return PoseCorrection({}, {}, {})
     before = {k: store[k].T_cw for k in ids}
@@ -37,3 +48,60 @@ def global_bundle(
     correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
     store.correct(correction)
     return correction
+
+
+def adjust_camera(matches: KeyframeMatches, ends: bool) -> None:
+    """Match all keyframes, and estimate the camera from the matches.
+
+    Matches always belong to the images as tracked: an estimated camera becomes that of the grid.
+    Where this ``ends`` the tracking and a correction was found, pairs that have moved are matched
+    again, everything is adjusted once more, and images are straightened for the map. Where the
+    focal length was not given (``KeyframeTable.focal_deviation``) the first matches are at half the
+    resolution, and all are measured again.
+    """
+    table = matches.keyframes.table
+    fine = matches.tracker.config.fine_adjustment
+    is_open = ends and table.focal_deviation > 0
+    matches.measure(fine and not is_open)
+    readout = correct_rows(matches, finds_readout=fine)
+    lens = correct_lens(matches, ends, readout=readout)
+    if not ends:
+        matches.graph.see_by(table.camera)
+        return
+    own = correct_frame_lenses(matches)
+    if lens or own or (is_open and fine):
+        matches.measure(fine, anew=is_open and fine)
+        let_lenses_move(matches, own.each)
+        correct_rows(matches, finds_readout=False)
+    if own:
+        own = correct_frame_lenses(matches, own)
+    if lens:
+        lens = correct_lens(matches, ends, before=lens) or lens
+    if lens or own:
+        found = found_lens(table.camera, matches.camera, lens)
+        sizes = torch.tensor([o.sizes for o in own.each.values()] or [FrameLens().sizes])
+        focal, right, down = sizes.double().square().mean(0).sqrt().tolist()
+        found = replace(found, varies_focal=focal, varies_centre=math.hypot(right, down))
+        straighten(matches.keyframes, FrameViews(StraightView(table.camera, found), own.each))
+
+
+def straighten(keyframes: KeyframeSet, views: FrameViews) -> None:
+    """Straighten the images of keyframes to the table's pinhole.
+
+    A prior's normals and a sensor's depths are resampled, too. Matches still belong to the images
+    as tracked.
+    """
+    table = keyframes.table
+    ids = keyframes.ids
+    arrays = table.arrays
+    view = {k.id: views.of(k.frame_index) for k in keyframes}
+    images = ordered_map(lambda id: view[id].image(keyframes[id].image), ids, worker_count())
+    for id, image in zip(ids, images, strict=True):
+        arrays.put("image", id, image, recent=True)
+        arrays.recent("encoded").drop(id)
+        for name in ("prior normal", "sensor depth"):
+            if (seen := arrays.get(name, id)) is not None:
+                arrays.put(name, id, view[id].nearest(seen))
+    table.lens = views.view.lens
+    own = {k.id: views.own.get(k.frame_index) for k in keyframes}
+    table.frame_lenses = {id: lens for id, lens in own.items() if lens is not None}

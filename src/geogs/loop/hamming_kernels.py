@@ -11,9 +11,11 @@ from geogs.kernel_parts import inlined
 
 _EXACT = {"cache": True, "nogil": True}
 _PAIRS, _FOURS, _EIGHTS, _BYTES = (
-    np.uint64(0x5555555555555555), np.uint64(0x3333333333333333),
-    np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101),
-)  # fmt: skip
+    np.uint64(0x5555555555555555),
+    np.uint64(0x3333333333333333),
+    np.uint64(0x0F0F0F0F0F0F0F0F),
+    np.uint64(0x0101010101010101),
+)
 _1, _2, _4, _56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
 
 
@@ -38,15 +40,21 @@ def two_nearest(source, target):
     second = np.full(len(source), 257, np.int64)
     for i in range(len(source)):
         a, b, c, d = source[i, 0], source[i, 1], source[i, 2], source[i, 3]
-        best, other, at = np.int64(257), np.int64(257), 0
+        best = np.int64(257)
+        other = np.int64(257)
+        at = 0
         for j in range(len(target)):
             distance = np.int64(
-                _ones(a ^ target[j, 0]) + _ones(b ^ target[j, 1])
-                + _ones(c ^ target[j, 2]) + _ones(d ^ target[j, 3])
-            )  # fmt: skip
+                _ones(a ^ target[j, 0])
+                + _ones(b ^ target[j, 1])
+                + _ones(c ^ target[j, 2])
+                + _ones(d ^ target[j, 3])
+            )
             if distance < best:
                 best, other, at = distance, best, j
             elif distance < other:
                 other = distance
-        index[i], nearest[i], second[i] = at, best, other
+        index[i] = at
+        nearest[i] = best
+        second[i] = other
     return index, nearest, second

@@ -101,7 +101,8 @@ class KeyframeMatches:
         At full resolution if ``fine``, else at half of it; small images always at full. If not
         ``anew``, pairs that have not moved since they were measured are kept.
         """
-        graph, odometry = self.graph, self.tracker.map.odometry
+        graph = self.graph
+        odometry = self.tracker.map.odometry
         batch = MATCHED_TOGETHER[self.keyframes.grid.on_gpu]
         if anew:
             graph.edges.clear()
@@ -131,7 +132,8 @@ class KeyframeMatches:
 
     def corrected(self, but: str = "") -> Measured:
         """Return the edges with all corrections, or all but one."""
-        grid, shifts = self.keyframes.grid, [s for n, s in self.corrections.items() if n != but]
+        grid = self.keyframes.grid
+        shifts = [s for n, s in self.corrections.items() if n != but]
         found = dict(self.measured)
         for part in in_parts(sorted(found) if shifts else [], grid.on_gpu):
             total = sum((each(part) for each in shifts[1:]), shifts[0](part))
@@ -142,7 +144,8 @@ class KeyframeMatches:
 
 def global_pairs(tracker: Tracker) -> list[Pair]:
     """Return pairs of neighbours in time and of revisits, thinned; not within a saved map."""
-    grid, ids = tracker.keyframes.grid, tracker.segment.ids
+    grid = tracker.keyframes.grid
+    ids = tracker.segment.ids
     pairs = proximity_pairs(
         tracker.keyframes,
         ids,
@@ -153,5 +156,6 @@ def global_pairs(tracker: Tracker) -> list[Pair]:
         MAX_DISTANCE * grid.camera.long_edge,
         PAIRS * len(ids),
     )
-    wanted, fixed = set(ids), set(tracker.segment.fixed)
+    wanted = set(ids)
+    fixed = set(tracker.segment.fixed)
     return [p for p in pairs if wanted.issuperset(p) and not fixed.issuperset(p)]

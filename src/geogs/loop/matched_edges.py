@@ -80,12 +80,14 @@ class MatchedEdges:
             valid.append(p.valid)
             r, w = weighed_residuals(p, self.pixels[chunk], self.weight[chunk], HUBER)
             w = FACTOR * w
-            J, D = p.pose_jacobian, p.depth_jacobian
+            J = p.pose_jacobian
+            D = p.depth_jacobian
             wJ = J * w.mT[:, None]
             H = (wJ.flatten(2) @ J.flatten(2).mT).double()
             v = (wJ.flatten(2) @ r.mT.flatten(1)[..., None])[..., 0].double()
             coupling = (wJ * D.mT[:, None]).sum(2)
-            curvature, b = (w * D.square()).sum(-1), (w * D * r).sum(-1)
+            curvature = (w * D.square()).sum(-1)
+            b = (w * D * r).sum(-1)
             adjoint = sim3_adjoint(S_ji)[:, :6]
             for frame, e in sources_within(i):
                 c = curvature[e].sum(0)
@@ -139,7 +141,9 @@ class LinearMatches:
         """Return equations over the keyframes; depths are damped by their curvature, too."""
         index = torch.zeros(0, dtype=torch.long)
         gradient = torch.zeros(self.keyframes, 7, dtype=torch.float64)
-        rows, columns, blocks = [index], [index], [gradient.new_zeros(0, 7, 7)]
+        rows = [index]
+        columns = [index]
+        blocks = [gradient.new_zeros(0, 7, 7)]
         for source in self.sources:
             depth = source.damped_depth(damping)
             at, block, g = source.reduced(depth)
@@ -154,7 +158,8 @@ class LinearMatches:
 
         The set of cells is fixed, so that a step cannot lower the cost by losing some from view.
         """
-        edges, d = self.edges, state.inverse_depth
+        edges = self.edges
+        d = state.inverse_depth
         assert d is not None
         total = 0.0
         for start in range(0, len(edges.source), CHUNK):

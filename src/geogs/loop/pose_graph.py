@@ -65,14 +65,10 @@ class PoseGraph:
     """Whether units do not drift, so that all scales are fixed."""
 
 
-@dataclass(frozen=True)
-class PoseGraphResult:
-    """The adjusted graph."""
+@dataclass(frozen=True, kw_only=True)
+class PoseGraphResult(GraphState):
+    """The adjusted graph, in each keyframe's unit of before."""
 
-    S: Float[Tensor, "n 4 4"]
-    """World to camera in the keyframe's unit of before, float64."""
-    inverse_depth: Float[Tensor, "n p"] | None
-    """Inverse depth in the keyframe's unit of before; None without matches."""
     loop_weight: Float[Tensor, "e"]
     """Robust weight of each relative pose, in [0, 1]; 1 for trusted ones."""
 
@@ -100,7 +96,8 @@ def solve(graph: PoseGraph) -> PoseGraphResult:
     The kernel starts so wide that it is convex over the errors of all loops at the given poses.
     Every step lowers the cost at its stage; the result is deterministic.
     """
-    matches, relative = graph.matches, RelativeTerm.of(graph.relative)
+    matches = graph.matches
+    relative = RelativeTerm.of(graph.relative)
     others = [] if matches is None else [matches]
     depth = None if matches is None else matches.inverse_depth
     state = GraphState(graph.start.double(), depth)
@@ -121,7 +118,7 @@ def solve(graph: PoseGraph) -> PoseGraphResult:
         )
         state = minimise(state, problem.linearise, problem.step, policy, _cost).state
     weights = relative.robust_weights(relative_errors(state.S, graph.relative))
-    return PoseGraphResult(state.S, state.inverse_depth, weights)
+    return PoseGraphResult(state.S, state.inverse_depth, loop_weight=weights)
 
 
 def pose_correction(
@@ -202,7 +199,9 @@ class LinearRelative:
         J_i, J_j = relative_jacobians(relative, e)
         W = self.term.information * self.term.robust_weights(e)[:, None]
         i, j = relative.source, relative.target
-        WJ_i, WJ_j, r = W[..., None] * J_i, W[..., None] * J_j, (W * e)[..., None]
+        WJ_i = W[..., None] * J_i
+        WJ_j = W[..., None] * J_j
+        r = (W * e)[..., None]
         cross = J_i.mT @ WJ_j
         gradient = torch.zeros(len(self.S), 7, dtype=torch.float64)
         gradient.index_add_(0, i, -(J_i.mT @ r)[..., 0])
@@ -212,7 +211,8 @@ class LinearRelative:
 
     def cost(self, state: GraphState) -> float:
         """Return the sum of |e|^2 of trusted edges, and of c^2 |e|^2 / (c^2 + |e|^2) of loops."""
-        term, limit = self.term, self.term.limit
+        term = self.term
+        limit = self.term.limit
         square = term.squares(relative_errors(state.S, term.relative))
         robust = torch.where(term.relative.is_loop, limit * square / (limit + square), square)
         return float(robust.sum())

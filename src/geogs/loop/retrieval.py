@@ -116,7 +116,8 @@ class AppearanceIndex:
         known = distance <= self._radius
         # Descriptors without a word still count in the image's own mass.
         own = float((~known).sum()) * np.log((rows + 1) / 0.5)
-        containing, mass = [np.zeros(0, np.int64)], [np.zeros(0)]
+        containing = [np.zeros(0, np.int64)]
+        mass = [np.zeros(0)]
         for word, count in _counts(words[known]).tolist():
             posting = self._postings[word].rows
             weight = max(np.log((rows + 1) / (len(posting) + 0.5)), 0.0)

@@ -98,7 +98,8 @@ class PlaceRecognition:
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"], depths: Depths) -> list[Recognition]:
         """Return keyframes recognised in an image, with its pose; most similar first."""
-        features, found = orb_features(image, self._mask), []
+        features = orb_features(image, self._mask)
+        found = []
         for id in self._similar(features, frozenset()):
             view = self._verifier.verify(self._view(id, depths), FeatureView(features))
             if view.accepted and view.is_metric and view.T_ji is not None:
@@ -116,7 +117,8 @@ class PlaceRecognition:
 
     def _candidates(self, query: Query) -> list[LoopCandidate]:
         """Return thinned pairs of a keyframe with earlier ones, by poses and appearance in turn."""
-        id, by_pose = query.id, query.by_pose
+        id = query.id
+        by_pose = query.by_pose
         by_appearance = self._similar(self.table.features[id], query.near)
         alternating: list[LoopCandidate] = []
         for n in range(max(len(by_pose), len(by_appearance))):

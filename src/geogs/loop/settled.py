@@ -43,8 +43,6 @@ def settled_pairs(
     }
     if not len(relative):
         return sorted(tracked)
-    known = sorted({*relative.source.tolist(), *relative.target.tolist()})
-    at, T_cw = between_positions(relative, known), segment.poses(known)
-    differs = differences(T_cw, at, segment.median_depths(known)) >= min_change
+    differs = differences(segment, relative) >= min_change
     changing = relative.select(relative.is_loop & differs)
     return sorted(tracked | ({*relative.pairs} - {*changing.pairs}))

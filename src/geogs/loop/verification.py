@@ -90,7 +90,8 @@ class TwoViewVerifier:
             a, b, pairs, depth = (x[depth > 0] for x in (a, b, pairs, depth))
             found = self._resect(a, b, depth)
         else:
-            depth, found = None, self._epipolar(a, b)
+            depth = None
+            found = self._epipolar(a, b)
         if found is None:
             return TwoViewMatch(False, "the matches agree on no pose", matches=len(pairs))
         T, inlier = found
@@ -125,7 +126,8 @@ class TwoViewVerifier:
         self, pixels: Float32[np.ndarray, "m 2"], depth: Float32[np.ndarray, "m"]
     ) -> Float64[np.ndarray, "m 3"]:
         """Return points in the camera frame."""
-        c, z = self.camera, depth.astype(np.float64)
+        c = self.camera
+        z = depth.astype(np.float64)
         x, y = (pixels[:, 0] - c.cx) / c.fx, (pixels[:, 1] - c.cy) / c.fy
         return np.stack([x * z, y * z, z], -1)
 
@@ -136,7 +138,8 @@ class TwoViewVerifier:
         depth: Float32[np.ndarray, "m"],
     ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
         """Estimate the pose by RANSAC over three points, refined on its inliers."""
-        points, image = self._points(a, depth), b.astype(np.float64)
+        points = self._points(a, depth)
+        image = b.astype(np.float64)
         limit = MAX_REPROJECTION * self._edge
         ok, r, t, chosen = cv2.solvePnPRansac(
             points,
@@ -152,7 +155,8 @@ class TwoViewVerifier:
         chosen = chosen[:, 0]
         r, t = cv2.solvePnPRefineLM(points[chosen], image[chosen], self._K, None, r, t)
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0], t[:, 0]
+        T[:3, :3] = cv2.Rodrigues(r)[0]
+        T[:3, 3] = t[:, 0]
         moved = points @ T[:3, :3].T + T[:3, 3]
         shown = cv2.projectPoints(points, r, t, self._K, None)[0][:, 0]
         inlier = (moved[:, 2] > 0) & (np.linalg.norm(shown - image, axis=1) < limit)
@@ -177,7 +181,8 @@ class TwoViewVerifier:
             E, a.astype(np.float64), b.astype(np.float64), self._K, distanceThresh=1e6, mask=mask
         )
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, t[:, 0]
+        T[:3, :3] = R
+        T[:3, 3] = t[:, 0]
         return T, ahead[:, 0] > 0
 
     def _spread(self, pixels: Float32[np.ndarray, "m 2"]) -> float:

@@ -21,8 +21,6 @@ USUAL_NOISE = 1e-4
 """Default variance of the noise of grey values (of 1), where it was not measured."""
 LEAST_NOISE = 1e-6
 """Least variance of the noise, about that of rounding to 8 bits."""
-_MEDIAN_TO_DEVIATION = 1.4826
-"""Ratio of standard deviation to median absolute value, normal distribution."""
 _THREADS = 1024
 """Threads of the one block, as many as one may have."""
 
@@ -92,6 +90,7 @@ def noise_between(
     bare = usable.sum() // 4
     apart = (grey - other).abs()[order]
     apart = torch.where(torch.arange(len(apart), device=grey.device) < bare, apart, torch.inf)
-    deviation = _MEDIAN_TO_DEVIATION * apart.sort().values[(bare // 2)[None]][0]
+    # A normal distribution's standard deviation is 1.4826 times its median absolute value.
+    deviation = 1.4826 * apart.sort().values[(bare // 2)[None]][0]
     found = (deviation.square() / 2).clamp(min=LEAST_NOISE)
     return torch.where(bare > _FEWEST, found, USUAL_NOISE)

@@ -71,9 +71,11 @@ class PhotoSettings(NamedTuple):
 
 def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> SingleViewSettings:
     """Settings for views of a camera; ``unit``, a length of the map, makes distortion unitless."""
-    c, pixels = config, camera.width * camera.height
+    c = config
+    pixels = camera.width * camera.height
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     return SingleViewSettings(
-        camera.fx, camera.fy, camera.cx, camera.cy,
+        *lens,
         depth=c.depth_weight / pixels,
         normal=c.normal_weight / pixels,
         consistency=c.normal_consistency_weight / pixels,
@@ -86,14 +88,16 @@ def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> Sin
         normal_epsilon=NORMAL_EPSILON,
         eta=SMOOTHNESS_ETA,
         rewards_edges=c.ablation.smoothness_rewards_edges,
-    )  # fmt: skip
+    )
 
 
 def photo_settings(config: LossConfig, camera: Camera, weight: float = 1.0) -> PhotoSettings:
     """Settings for pairs of a camera's photometric images, each pair with this ``weight``."""
-    c, pixels = config, camera.width * camera.height
+    c = config
+    pixels = camera.width * camera.height
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     return PhotoSettings(
-        camera.fx, camera.fy, camera.cx, camera.cy,
+        *lens,
         min_depth_ratio=MIN_DEPTH_RATIO,
         occlusion=occlusion_tolerance(c, camera),
         l1=weight * c.l1_weight / pixels,
@@ -106,7 +110,7 @@ def photo_settings(config: LossConfig, camera: Camera, weight: float = 1.0) -> P
         min_coverage=MIN_COVERAGE,
         variance_floor=NCC_VARIANCE_FLOOR,
         ssim=weight * c.ssim_weight / pixels,
-    )  # fmt: skip
+    )
 
 
 def record(settings: SingleViewSettings | PhotoSettings) -> np.void:

@@ -113,7 +113,8 @@ class PhotoView:
 
 def _local_variance(grey: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Variance in the window around each pixel, mirrored at the border, of an image on a CPU."""
-    image, side = grey.numpy(), (_TEXTURE_SIDE, _TEXTURE_SIDE)
+    image = grey.numpy()
+    side = (_TEXTURE_SIDE, _TEXTURE_SIDE)
     mean, square = (cv2.boxFilter(each, -1, side) for each in (image, image * image))
     return torch.from_numpy(square - mean * mean).clamp(min=0)
 
@@ -138,7 +139,8 @@ def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
     """
     if not config.colour:
         return ((0, config),)
-    l1, ssim_weight = config.l1_weight / 3, config.ssim_weight / 3
+    l1 = config.l1_weight / 3
+    ssim_weight = config.ssim_weight / 3
     each = replace(config, l1_weight=l1, ssim_weight=ssim_weight, ncc_weight=0.0)
     grey = replace(config, l1_weight=0.0, ssim_weight=0.0)
     colours = tuple((k, each) for k in (1, 2, 3)) if max(l1, ssim_weight) > 0 else ()

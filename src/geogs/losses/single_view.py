@@ -58,13 +58,11 @@ class ViewConstants:
         size = (camera.width, camera.height)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         rgb = torch.from_numpy(small).to(prior_depth.device).float() / 255
+        edge = edge_strength(rgb)
+        gradient = gradient_norm(rgb)
+        normal = None if prior_normal is None else prior_normal.float()
         return ViewConstants(
-            camera=camera,
-            edge=edge_strength(rgb),
-            image_gradient=gradient_norm(rgb),
-            prior_depth=prior_depth.float(),
-            confidence=confidence.float(),
-            prior_normal=None if prior_normal is None else prior_normal.float(),
+            camera, edge, gradient, prior_depth.float(), confidence.float(), normal
         )
 
     @functools.cached_property
@@ -76,7 +74,8 @@ class ViewConstants:
         """
         camera = self.camera.resized(self.camera.width // 2, self.camera.height // 2)
         size = (camera.height, camera.width)
-        known, outside = self.prior_depth > 0, self.prior_depth < 0
+        known = self.prior_depth > 0
+        outside = self.prior_depth < 0
         inverse = torch.where(known, 1 / self.prior_depth.clamp(min=1e-9), 0.0)
         weight = torch.where(known, self.confidence, 0.0)
         maps = torch.stack(
@@ -93,10 +92,9 @@ class ViewConstants:
             mean = F.adaptive_avg_pool2d(self.prior_normal.movedim(-1, 0), size).movedim(0, -1)
             length = mean.norm(dim=-1, keepdim=True)
             normal = torch.where(length > 0.5, mean / length.clamp(min=1e-6), 0.0)
-        return ViewConstants(
-            camera, edge, gradient, torch.where(beyond > 0.5, OUTSIDE, depth),
-            torch.where(one, mean_weight, 0.0), normal,
-        )  # fmt: skip
+        depth = torch.where(beyond > 0.5, OUTSIDE, depth)
+        confidence = torch.where(one, mean_weight, 0.0)
+        return ViewConstants(camera, edge, gradient, depth, confidence, normal)
 
 
 def edge_strength(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:

@@ -72,7 +72,9 @@ def sightings(
     points: Float64[np.ndarray, "p 3"],
 ) -> Sightings:
     """Find the points that each camera sees at about its typical depth."""
-    point, view, ray = [], [], []
+    point = []
+    view = []
+    ray = []
     for i, T in enumerate(T_cw):
         x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
         ahead = (z > typical[i] / _DEPTHS) & (z < typical[i] * _DEPTHS)
@@ -85,8 +87,8 @@ def sightings(
         view.append(np.full(len(seen), i))
         ray.append((way / np.linalg.norm(way, axis=1, keepdims=True)).astype(np.float32))
     by_point = np.argsort(np.concatenate(point), kind="stable")
-    all_points, all_views = np.concatenate(point)[by_point], np.concatenate(view)[by_point]
-    return Sightings(all_points, all_views, np.concatenate(ray)[by_point], len(T_cw))
+    points, images, rays = (np.concatenate(parts)[by_point] for parts in (point, view, ray))
+    return Sightings(points, images, rays, len(T_cw))
 
 
 def coverage_order(
@@ -108,8 +110,10 @@ def coverage_order(
     newness = np.ones(len(seen.point))
     worth = _ALONE * newness
     sees = np.diff(own).astype(np.float64)
-    gain, fresh = _ALONE * sees, sees.copy()
-    count, left = np.zeros(points, np.int64), np.ones(seen.views, bool)
+    gain = _ALONE * sees
+    fresh = sees.copy()
+    count = np.zeros(points, np.int64)
+    left = np.ones(seen.views, bool)
     while True:
         left &= (fresh > copy * sees) | (sees == 0)
         if not left.any():
@@ -130,7 +134,8 @@ def coverage_order(
         of = seen.view[rivals]
         fresh += np.bincount(of, now - newness[rivals], seen.views)
         gain += np.bincount(of, value - worth[rivals], seen.views)
-        newness[rivals], worth[rivals] = now, value
+        newness[rivals] = now
+        worth[rivals] = value
 
 
 def _newness(cosine: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:

@@ -123,10 +123,7 @@ class _FirstLook:
     """Small images, each read once when it is first needed, and sweeps over them."""
 
     def __init__(
-        self,
-        poses: Sequence[ViewPose],
-        image_at: Callable[[int], SmallImage],
-        working: Camera,
+        self, poses: Sequence[ViewPose], image_at: Callable[[int], SmallImage], working: Camera
     ) -> None:
         self._poses = poses
         self._image_at = image_at
@@ -161,7 +158,8 @@ class _FirstLook:
             grey = cv2.resize(large * np.float32(1 / 255), size, interpolation=cv2.INTER_AREA)
             colours = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             unknown = np.zeros((1, 1), np.float32)
-            place, inside = self._poses[index], np.ones(grey.shape, bool)
+            place = self._poses[index]
+            inside = np.ones(grey.shape, bool)
             if mask is not None:
                 inside = cv2.resize(mask.astype(np.uint8), size) > 0
             view = DepthView(place.id, place.T_cw, grey, grey, colours, unknown, unknown)

@@ -1,9 +1,11 @@
 """The dense depths of the map's keyframes: searched, fused with a sensor, and checked."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -11,7 +13,6 @@ from geogs.config import DepthSensorConfig
 from geogs.depth.depth_engine import DepthEngine, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision.segment_planes import planar_depth
-from geogs.depth.sensor_fusion import fused_with_sensor
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
@@ -26,6 +27,14 @@ CHECKING_VIEWS = 8
 """Keyframes whose depth checks a new keyframe's depth and whose free space carves around it."""
 SEARCHED_TOGETHER = 32
 """Keyframes whose images and depths are in memory at once when all are searched again."""
+TOLERANCE = 0.02
+"""Relative error below which a depth is right: confidences are the chance of that."""
+MIN_DEVIATION = 0.02
+"""Least relative deviation of a searched depth where there is a measured one."""
+MAX_DIFFERENCE = 3.0
+"""Standard deviations of the difference beyond which the searched depth is an outlier."""
+MAX_CONFIDENCE = 0.98
+"""Largest confidence of a measured depth."""
 
 
 class KeyframeDepths:
@@ -62,7 +71,9 @@ class KeyframeDepths:
 
     def check(self, views: Sequence[MapView]) -> None:
         """Revise the depths of views by those of their neighbours, all as they were estimated."""
-        device, arrays, checked = self.views.arrays.device, ArrayTable(), []
+        device = self.views.arrays.device
+        arrays = ArrayTable()
+        checked = []
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
             others = [[o.posed for o in self.near(view)] for view in batch]
@@ -101,7 +112,8 @@ class KeyframeDepths:
 
     def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
         """The other views that suit a search around a depth, best first."""
-        poses, camera = [v.view_pose for v in others], self.views.arrays.cameras.render
+        poses = [v.view_pose for v in others]
+        camera = self.views.arrays.cameras.render
         chosen = select_sweep_neighbours(view.view_pose, poses, depth, camera)
         return [others[i] for i in chosen]
 
@@ -120,7 +132,8 @@ class KeyframeDepths:
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
         """The searched depth, fused with a sensor's if there is one."""
-        keyframe, render = view.keyframe, self.views.arrays.cameras.render
+        keyframe = view.keyframe
+        render = self.views.arrays.cameras.render
         if keyframe.measured is None or (metres := keyframe.sensor_depth) is None:
             return searched
         found = sensor_depth(metres, self.sensor).resized(render.width, render.height)
@@ -134,3 +147,27 @@ def tracked_depth(keyframe: Keyframe) -> float:
     z = 1 / keyframe.inverse_depth.clamp(min=1e-3)
     known = z / keyframe.confident_information.clamp(min=1e-12).sqrt() < 0.2
     return float(z[known].median() if int(known.sum()) > 8 else z.median())
+
+
+def fused_with_sensor(
+    searched: DenseDepth, inverse_depth: Float[Tensor, "h w"], information: Float[Tensor, "h w"]
+) -> DenseDepth:
+    """Mean of the searched and the measured depth, weighted by their inverse variances.
+
+    Where they do not agree, the measured depth; where nothing was measured, the searched one. The
+    measurement is an inverse depth, per map unit, and its information 1 / sigma^2, 0 for none.
+    """
+    known = information > 0
+    measured = torch.where(known, 1 / inverse_depth.clamp(min=1e-12), searched.depth)
+    own = torch.where(known, measured / information.clamp(min=1e-12).sqrt(), 1.0)
+    chance = searched.confidence.clamp(1e-3, 1 - 1e-3)
+    theirs = (TOLERANCE / (math.sqrt(2) * torch.erfinv(chance))).clamp(min=MIN_DEVIATION)
+    step = searched.depth / measured - 1
+    agree = step.abs() < MAX_DIFFERENCE * torch.hypot(own, theirs)
+    fraction = torch.where(known & agree, own.square() / (own.square() + theirs.square()), 0.0)
+    depth = torch.where(known, measured * (1 + fraction * step), searched.depth)
+    deviation = own * (1 - fraction).sqrt()
+    right = torch.erf(TOLERANCE / (math.sqrt(2) * deviation)).clamp(max=MAX_CONFIDENCE)
+    confidence = torch.where(known, right, searched.confidence)
+    median = depth.median().cpu()
+    return replace(searched, depth=depth, confidence=confidence, median=median, written=None)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, ViewPose, depth_images
-from geogs.depth.revision.bare_segments import bare_segments
+from geogs.depth.revision.segment_planes import bare_segments
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.exposure import identity_exposure
 from geogs.losses.multi_view import PhotoView
@@ -127,7 +127,8 @@ class MapView:
             self.arrays.table.arrays.drop("rendered depth", self.id)
         if self.id in self.arrays.loaded or depth is not None:
             loaded = self.arrays.load(self.id)
-            loaded.rendered_depth, loaded.is_render_written = depth, False
+            loaded.rendered_depth = depth
+            loaded.is_render_written = False
 
     def set_depth(self, depth: DenseDepth) -> None:
         """Set the dense depth, and the losses' constants that depend on it."""

@@ -36,7 +36,8 @@ def map_all(
     ids = [i for i in covering(mapper, keyframe_ids) if not mapper.views[i].has_depth]
     until = None
     if time_budget is not None:
-        ids, until = spread_order(ids), time.perf_counter() + SEARCHED * time_budget
+        ids = spread_order(ids)
+        until = time.perf_counter() + SEARCHED * time_budget
     # In groups just large enough for all cores, so that an interruption takes effect soon.
     search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until, group_size())
     if not mapper.table.mapped:
@@ -56,7 +57,8 @@ def covering(mapper: Mapper, keyframe_ids: Sequence[int]) -> list[int]:
 
     Where a camera lingers or returns, others see the same points along nearly the same rays.
     """
-    views, camera = [mapper.views[i] for i in keyframe_ids], mapper.cameras.render
+    views = [mapper.views[i] for i in keyframe_ids]
+    camera = mapper.cameras.render
     if not views:
         return []
     T_cw = np.stack([view.T_cw.numpy() for view in views])
@@ -97,9 +99,11 @@ def search_depths(
     one would take longer; the first group is always done.
     """
     ids = list(keyframe_ids)
-    done, size = 0, at_once if until is None else group_size()
+    done = 0
+    size = at_once if until is None else group_size()
     while done < len(ids) and size > 0:
-        start, group = time.perf_counter(), ids[done : done + size]
+        start = time.perf_counter()
+        group = ids[done : done + size]
         mapper.search_depths(group)
         done += len(group)
         if until is not None:
@@ -113,6 +117,7 @@ def _affordable(start: float, searched: int, until: float) -> int:
 
     Half of those that fit into the time, as the pace may change.
     """
-    now, least = time.perf_counter(), worker_count()
+    now = time.perf_counter()
+    least = worker_count()
     count = int((until - now) * searched / max(now - start, 1e-9))
     return 0 if count < least else max(least, min(count // 2, _AT_ONCE))

@@ -1,7 +1,6 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,8 +24,8 @@ from geogs.mapping.rendered import (
     rendered_surface,
     searched_keyframe,
     shown_depth,
+    stored_render,
 )
-from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mapping.training.full import FullTraining
 from geogs.mapping.training.map_trainer import draw_batch, draw_views
 from geogs.mapping.training.trainer_choice import map_trainer
@@ -83,10 +82,9 @@ class Mapper:
         check_map(table, keyframes, (render.height, render.width))
         self.table = table
         self.views = KeyframeViews(ViewArrays(table, keyframes, self.cameras, config.loss))
-        engine = depth_engine(
-            table.disks.device, render, self.cameras.working, config.depth,
-            keyframes.arrays.resident,
-        )  # fmt: skip
+        working = self.cameras.working
+        resident = keyframes.arrays.resident
+        engine = depth_engine(table.disks.device, render, working, config.depth, resident)
         self.depths = KeyframeDepths(engine, self.views, sensor, config.depth.bare_planes)
         self.partners = Partners(self.views, table, config.photo)
         self.growth = DiskGrowth(table, self.depths, config)
@@ -100,10 +98,8 @@ class Mapper:
         if self._trainer is None:
             if self.table.unit is None:
                 self.table.unit = _unit(self.views[self.table.mapped[0]])
-            self._trainer = map_trainer(
-                self.table.disks, self.cameras, self.config, self.table.unit,
-                self.keyframes.arrays.resident,
-            )  # fmt: skip
+            scene = (self.table.disks, self.cameras, self.config, self.table.unit)
+            self._trainer = map_trainer(*scene, self.keyframes.arrays.resident)
         return self._trainer
 
     def settle(self) -> None:
@@ -138,7 +134,8 @@ class Mapper:
 
         Their depths are rendered from the map, inside ``masks``, and are not searched again.
         """
-        parameters, rules = DiskParameters.of(disks), SurfaceRules.of(self.config)
+        parameters = DiskParameters.of(disks)
+        rules = SurfaceRules.of(self.config)
         for i in ids:
             self.observe(i, masks.get(i))
             view = self.views[i]
@@ -152,8 +149,11 @@ class Mapper:
 
     def map_keyframe(self, keyframe_id: int) -> None:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
-        view, table, disk = self.views[keyframe_id], self.table, self.config.disk
-        random, mapped = table.random.of_numpy, [*table.mapped, keyframe_id]
+        view = self.views[keyframe_id]
+        table = self.table
+        disk = self.config.disk
+        random = table.random.of_numpy
+        mapped = [*table.mapped, keyframe_id]
         drawn = draw_views(mapped, self.config.iterations, self.config, random)
         # Old views are read from a file while the depth is searched.
         self.views.arrays.read_ahead({i for ids in drawn for i in ids if i != keyframe_id})
@@ -195,10 +195,9 @@ class Mapper:
         views = [v for v in self.views.values() if v.has_depth]
         views = views[:: 1 + len(views) // _COVISIBLE]
         disks = self.table.disks
-        moves = plan_update(
-            disks.position, disks.keyframe_id, correction, self.config.ablation.map_update,
-            (covisible_keyframe(v, correction) for v in views),
-        )  # fmt: skip
+        covisible = (covisible_keyframe(v, correction) for v in views)
+        strategy = self.config.ablation.map_update
+        moves = plan_update(disks.position, disks.keyframe_id, correction, strategy, covisible)
         if len(disks):
             disks.transform(moves)
             self.trainer.forget_renders(self.views.values())
@@ -231,7 +230,8 @@ class Mapper:
     def refine(self, progress: Progress = silent) -> None:
         """Train over all mapped keyframes, at least one, with the final poses, after searching
         their depths again if the settings require it."""
-        searched, start = self._searched(), SEARCHED if self.config.final_depth else 0.0
+        searched = self._searched()
+        start = SEARCHED if self.config.final_depth else 0.0
         if self.config.final_depth and searched:
             self.depths.estimate(searched, lambda fraction: progress(SEARCHED * fraction))
             self.check_depths()
@@ -273,12 +273,14 @@ class Mapper:
             OutputError: the disk is full, or cannot be written.
         """
         parameters = DiskParameters.of(self.table.disks.snapshot() if disks is None else disks)
-        camera, archive, stored = self.cameras.render, Archive(), []
-        rules, images = SurfaceRules.of(self.config), self.keyframes.arrays.pieces.get("image", {})
+        archive = Archive()
+        stored = []
+        rules = SurfaceRules.of(self.config)
+        images = self.keyframes.arrays.pieces.get("image", {})
         for view in self._mapped(of):
-            render = rendered_keyframe(view, parameters, camera, rules)
+            render = rendered_keyframe(view, parameters, rules)
             stored.append(stored_render(render, images[view.id], archive))
-        return OnDemand(stored, StoredRender.load)
+        return OnDemand(stored, lambda load: load())
 
     def renderer(self, frame: MapFrame = WORLD) -> MapRenderer:
         """A renderer of the current map from any pose in the world that ``frame`` relates to it."""
@@ -290,7 +292,7 @@ class Mapper:
 
         They are not rendered; each is read on access, as it is then.
         """
-        return OnDemand(self._mapped(of), partial(searched_keyframe, camera=self.cameras.render))
+        return OnDemand(self._mapped(of), searched_keyframe)
 
     def _mapped(self, ids: Sequence[int] | None = None) -> list[MapView]:
         """Views of all mapped keyframes, or of some."""

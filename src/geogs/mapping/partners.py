@@ -34,7 +34,9 @@ class Partners:
     """Chooses the photometric partners of mapped views and compensates their exposure."""
 
     def __init__(self, views: KeyframeViews, table: MapTable, config: PhotoConfig) -> None:
-        self._views, self._table, self._config = views, table, config
+        self._views = views
+        self._table = table
+        self._config = config
 
     def choose(self, views: Sequence[MapView]) -> None:
         """Partners of some mapped views, then their exposures."""
@@ -67,7 +69,8 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
     others = [o for o in others if o.id != view.id]
     if not others:
         return []
-    poses, camera = [o.view_pose for o in others], view.arrays.cameras.render
+    poses = [o.view_pose for o in others]
+    camera = view.arrays.cameras.render
     pairs = view_pairs(view.view_pose, poses, view.typical_depth, camera)
     usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG, config.max_view_angle)
     scores = pairs.misfit(BEST_PARALLAX_DEG)
@@ -97,7 +100,8 @@ def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
     theirs, inside = _sampled(greys, view.photo.camera, there)
     gain, offset, _ = torch.stack([other.exposure for other in others])[..., None].unbind(1)
     common = (usable & inside & _is_exposed((theirs - offset) / gain)).flatten()
-    mine, texture = mine.repeat(len(others)), texture.repeat(len(others))
+    mine = mine.repeat(len(others))
+    texture = texture.repeat(len(others))
     gain, offset = relative_exposure(mine, theirs.flatten(), common)
     noise = noise_between(gain * mine + offset, theirs.flatten(), texture, common)
     return torch.stack([gain, offset, noise])

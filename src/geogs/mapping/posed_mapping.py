@@ -52,7 +52,9 @@ class PosedMapping:
         If time is short, fewer images are searched: the first ones if ``in_order``, else evenly
         spread ones.
         """
-        search, mapper, budget = self._search, self._mapper, self._budget
+        search = self._search
+        mapper = self._mapper
+        budget = self._budget
         camera = mapper.cameras.working
         known.expect_depths(mapper.views.values(), points, camera)
         part = 0.5 if search.repeat else 1.0
@@ -63,13 +65,16 @@ class PosedMapping:
             known.expect_depths(new, points, camera)
         ids = [*mapper.views] if in_order else spread_order([*mapper.views])
         wanted = budget.views or len(ids)
-        start, end, before = time.perf_counter(), budget.training_end, len(mapper.table.mapped)
+        start = time.perf_counter()
+        end = budget.training_end
+        before = len(mapper.table.mapped)
         until = None if end is None else start + search.depth_ratio * (end - start)
         if until is not None:  # images beyond those in the budget take time in the mesh, too
             until -= budget.output_cost.a_view * group_size()
         order = [i for i in ids if not mapper.views[i].has_depth]
         search_depths(mapper, order, lambda f: progress(part * f), until)
-        now, mapped = time.perf_counter(), mapper.table.mapped
+        now = time.perf_counter()
+        mapped = mapper.table.mapped
         again = (now - start) * len(mapped) / max(len(mapped) - before, 1)
         affordable = end is None or 3 * again < end - now
         if search.repeat and affordable and len(mapped) >= wanted:
@@ -88,15 +93,15 @@ class PosedMapping:
         self._mapper.train(self._steps(end, goes_on), progress, end, goes_on)
 
     def _steps(self, end: float | None, goes_on: bool) -> int:
-        search, mapper = self._search, self._mapper
+        search = self._search
+        mapper = self._mapper
         views = len(mapper.table.mapped)
         if end is None:
             return max(search.least_steps, search.steps_per_view * views)
-        done, spent = 0, 0.0
-        if goes_on:
-            done, spent = mapper.table.place.steps, mapper.table.place.seconds
+        place = mapper.table.place
+        done = place.steps if goes_on else 0
         if done > _ENOUGH_STEPS:
-            seconds = spent / done
+            seconds = place.seconds / done
         else:
             seconds = seconds_per_step(mapper.table, mapper.views, mapper.trainer, mapper.config)
         left = max(end - time.perf_counter(), 0.0)
@@ -107,7 +112,8 @@ class PosedMapping:
 
         In two groups, as the first one warms up.
         """
-        group, ids = group_size(), list(self._mapper.views)
+        group = group_size()
+        ids = list(self._mapper.views)
         groups = [g for g in (ids[:group], ids[group : 2 * group]) if g]
         for some in groups:
             begin = time.perf_counter()

@@ -1,6 +1,8 @@
 """Depth maps of keyframes for surface fusion: rendered from disks, or as searched."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +22,7 @@ from geogs.mapping.map_frame import MapFrame
 from geogs.short_repr import ShortRepr
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, RenderedKeyframe
+from geogs.world.archive import Archive, Archived
 from geogs.world.disks import DiskParameters
 
 _RADIUS = 3
@@ -127,7 +130,8 @@ def rendered_surface(
     normal = torch.where(depth[..., None] > 0, output.normal / length, 0.0)
     # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
     # while the median is on one.
-    spread, facing = (output.median_depth - depth).abs(), _facing(normal, camera)
+    spread = (output.median_depth - depth).abs()
+    facing = _facing(normal, camera)
     single = spread < rules.max_spread * depth
     slanted = ~widened(facing > _SLANTED, _AROUND)
     single |= slanted & (spread * facing < 2 * rules.max_spread * depth)
@@ -155,23 +159,47 @@ def shown_depth(maps: SurfaceMaps) -> DenseDepth:
 
 
 def rendered_keyframe(
-    view: MapView, disks: DiskParameters, camera: Camera, rules: SurfaceRules
+    view: MapView, disks: DiskParameters, rules: SurfaceRules
 ) -> RenderedKeyframe:
     """Disks seen from a view inside its mask."""
-    maps = rendered_surface(disks, camera, view.T_cw, rules, view.mask)
-    return _keyframe(view, camera, maps)
+    camera = view.arrays.cameras.render
+    return _keyframe(view, rendered_surface(disks, camera, view.T_cw, rules, view.mask))
 
 
-def searched_keyframe(view: MapView, camera: Camera) -> RenderedKeyframe:
+def searched_keyframe(view: MapView) -> RenderedKeyframe:
     """A view's own dense depth where its confidence, which is the weight, is not zero."""
     weight = view.dense.confidence
     depth = torch.where(weight > 0, view.dense.depth, 0.0)
-    normal, _ = normals_from_depth(depth, camera)
-    return _keyframe(view, camera, SurfaceMaps(depth, normal, weight))
+    normal, _ = normals_from_depth(depth, view.arrays.cameras.render)
+    return _keyframe(view, SurfaceMaps(depth, normal, weight))
 
 
-def _keyframe(view: MapView, camera: Camera, maps: SurfaceMaps) -> RenderedKeyframe:
+def _keyframe(view: MapView, maps: SurfaceMaps) -> RenderedKeyframe:
     frame = view.keyframe
+    camera = view.arrays.cameras.render
     return RenderedKeyframe(
         view.id, camera, view.T_cw, *maps, frame.image, frame.timestamp, view.mask
     )
+
+
+def stored_render(
+    render: RenderedKeyframe, image: Archived, archive: Archive
+) -> Callable[[], RenderedKeyframe]:
+    """Put a rendering into an archive; returns what reads it, and its image, into memory.
+
+    Normals are stored in half precision.
+
+    Raises:
+        OutputError: the disk is full, or cannot be written.
+    """
+    maps = (render.depth, render.normal.half(), render.weight)
+    stored = [archive.put(values.cpu().numpy()) for values in maps]
+    device = render.depth.device
+    keyframe = partial(RenderedKeyframe, render.keyframe_id, render.camera, render.T_cw)
+    keyframe = partial(keyframe, timestamp=render.timestamp, mask=render.mask)
+
+    def load() -> RenderedKeyframe:
+        loaded = (torch.from_numpy(values.load()).to(device).float() for values in stored)
+        return keyframe(*loaded, image=image.load())
+
+    return load

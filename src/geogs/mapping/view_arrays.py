@@ -1,6 +1,7 @@
 """Image-sized data of the keyframes of mapping: in memory while it is used, else in a file."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,7 +16,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import DepthJumps, depth_jumps
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
-from geogs.mapping.read_ahead import Basis, ReadAhead
+from geogs.threads import worker_count
 from geogs.world.arrays import ArrayTable
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from geogs.world.lru import LruCache
@@ -24,6 +25,10 @@ from geogs.world.map import MapTable, SearchedDepth
 DEPTHS_ON_GPU = 512
 """Most depths of unused views that stay on a GPU, as an upload takes longer than their use; at
 320 x 180 pixels with normals they take 600 MB."""
+READING_THREADS = 4
+"""Most threads that read ahead; each mostly waits for a disk or a GPU."""
+Basis = tuple[object, ...]
+"""The replaceable objects that a view is loaded from."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +150,9 @@ class ViewArrays:
 
     def set_depth(self, id: int, depth: DenseDepth) -> None:
         """Set the dense depth, and the losses' constants that depend on it."""
-        keyframe, mask, render = self.keyframes[id], self.mask(id), self.cameras.render
+        keyframe = self.keyframes[id]
+        mask = self.mask(id)
+        render = self.cameras.render
         if (moving := keyframe.shown_moving) is not None:
             moving = keyframe.grid.enlarged(moving, render.width, render.height)
             depth = depth.unknown_in(moving)
@@ -155,13 +162,17 @@ class ViewArrays:
         if loaded is None:
             self._write_depth(id, depth, keyframe.scale)
             return
-        loaded.depth, loaded.scale, loaded.is_depth_written = depth, keyframe.scale, False
+        loaded.depth = depth
+        loaded.scale = keyframe.scale
+        loaded.is_depth_written = False
         if loaded.constants is not None:
             prior, confidence, normal = self._prior(id, loaded, depth)
             loaded.constants = replace(
-                loaded.constants, prior_depth=prior.float(), confidence=confidence.float(),
+                loaded.constants,
+                prior_depth=prior.float(),
+                confidence=confidence.float(),
                 prior_normal=normal,
-            )  # fmt: skip
+            )
 
     def constants(self, id: int) -> ViewConstants:
         """Constants of the single-view losses; the keyframe must have a depth."""
@@ -173,8 +184,10 @@ class ViewArrays:
 
     def _load(self, id: int, as_written: bool = False) -> LoadedView:
         """Read a view; its depth at the keyframe's scale, or as it was written."""
-        cameras, loss = self.cameras, self.loss
-        keyframe, row = self.keyframes[id], self.table.views[id]
+        cameras = self.cameras
+        loss = self.loss
+        keyframe = self.keyframes[id]
+        row = self.table.views[id]
         image = keyframe.image
         photo = PhotoView.prepare(
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
@@ -202,7 +215,8 @@ class ViewArrays:
 
     def _basis(self, id: int) -> Basis:
         """The objects that a view is loaded from; a change replaces them."""
-        keyframe, row = self.keyframes[id], self.table.views[id]
+        keyframe = self.keyframes[id]
+        row = self.table.views[id]
         rendered = self.table.arrays.pieces.get("rendered depth", {}).get(id)
         return keyframe, keyframe.scale, row.exposure, row.depth, rendered
 
@@ -214,21 +228,24 @@ class ViewArrays:
         loaded.is_depth_written = loaded.is_render_written = True
 
     def _write_depth(self, id: int, depth: DenseDepth, scale: float) -> None:
-        arrays, row = self.table.arrays, self.table.views[id]
+        arrays = self.table.arrays
+        row = self.table.views[id]
         row.depth = put_depth(arrays, id, depth, scale)
         if self.device.type == "cuda":
             arrays.recent("depth there", DEPTHS_ON_GPU).put(id, (row.depth, depth))
 
     def _read_depth(self, id: int, scale: float) -> DenseDepth:
         """Read the written depth at a scale of its keyframe."""
-        arrays, written = self.table.arrays, self.table.views[id].depth
+        arrays = self.table.arrays
+        written = self.table.views[id].depth
         assert written is not None, f"keyframe {id} has no depth yet"
         if self.device.type == "cuda":
             recent = arrays.recent("depth there", DEPTHS_ON_GPU)
             known = recent.peek(id)
             if known is not None and known[0] is written:
                 recent.put(id, known)
-                depth, typical = known[1], torch.tensor(written.typical_at(scale))
+                depth = known[1]
+                typical = torch.tensor(written.typical_at(scale))
                 scaled = depth.depth * (scale / written.scale)
                 return replace(depth, depth=scaled, median=typical, written=None)
         return get_depth(arrays, id, written, scale, self.device)
@@ -244,7 +261,8 @@ class ViewArrays:
         self, id: int, loaded: LoadedView, depth: DenseDepth
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w 3"] | None]:
         """Depth, its weight in L_d, and normals: a prior's, else those that came with the depth."""
-        is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
+        is_measured = self.keyframes[id].measured is not None
+        mask = self.mask(id)
         weight = depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
         at_edges = confident_jumps(depth).around(self.loss.edge_reach)
         prior = depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE)
@@ -281,12 +299,15 @@ def get_depth(
     depth, confidence = (torch.from_numpy(arrays.load(n, id)) for n in ("depth", "confidence"))
     if scale != stored.scale:
         depth = depth * (scale / stored.scale)
-    normal, sky = arrays.get("depth normal", id), arrays.get("sky", id)
+    normal = arrays.get("depth normal", id)
+    sky = arrays.get("sky", id)
     return DenseDepth(
-        depth.to(device), confidence.to(device), torch.tensor(stored.typical_at(scale)),
+        depth.to(device),
+        confidence.to(device),
+        torch.tensor(stored.typical_at(scale)),
         normal=None if normal is None else torch.from_numpy(normal).float().to(device),
         sky=None if sky is None else torch.from_numpy(sky).to(device),
-    )  # fmt: skip
+    )
 
 
 def confident_jumps(depth: DenseDepth) -> DepthJumps:
@@ -310,3 +331,48 @@ def _shrunk_normal(
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     unit = np.where(length > 0.5, mean / np.maximum(length, 1e-6), 0.0)
     return torch.from_numpy(unit.astype(np.float32)).to(device)
+
+
+class ReadAhead:
+    """Loads views by id in threads before they are used; ``take`` returns what loading now would.
+
+    Views whose ``Basis`` has changed since are discarded.
+    """
+
+    def __init__(
+        self, load: Callable[[int], LoadedView], basis: Callable[[int], Basis], device: torch.device
+    ) -> None:
+        """``load`` loads a view; several threads call it, on a GPU in the stream of ``begin``."""
+        self._load = load
+        self._basis = basis
+        self._device = device
+        self._readings: dict[int, tuple[Future[LoadedView], Basis]] = {}
+        threads = min(READING_THREADS, worker_count())
+        self._threads = ThreadPoolExecutor(threads, "views", torch.set_num_threads, (1,))
+
+    def begin(self, ids: Iterable[int]) -> None:
+        """Begin to load some views, and discard those of the last call that are not among them."""
+        before = self._readings
+        self._readings = {}
+        stream = torch.cuda.current_stream() if self._device.type == "cuda" else None
+        for id in ids:
+            known = before.pop(id, None)
+            if known is None:
+                known = self._threads.submit(self._read, id, stream), self._basis(id)
+            self._readings[id] = known
+        for left, _ in before.values():
+            left.cancel()
+
+    def take(self, id: int) -> LoadedView | None:
+        """A view that was or is being loaded; None if it was not, or its basis has changed."""
+        reading = self._readings.pop(id, None)
+        if reading is None:
+            return None
+        view, basis = reading
+        if any(a is not b for a, b in zip(basis, self._basis(id), strict=True)):
+            return None
+        return view.result()
+
+    def _read(self, id: int, stream: "torch.cuda.Stream | None") -> LoadedView:
+        with torch.cuda.stream(stream):
+            return self._load(id)

@@ -16,12 +16,12 @@ from torch import Tensor
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mesh.clean import cleaned
-from geogs.mesh.extract import VolumePlan, integrate
+from geogs.mesh.extract import VolumePlan, integrate, pixel_planes
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.contraction import Contraction
 from geogs.mesh.volume.free_space import FreeSpace
 from geogs.mesh.volume.level_set import CHUNK, SurfacePart, stitched, surface_parts
-from geogs.mesh.volume.pixel_planes import PixelPlanes, widest
+from geogs.mesh.volume.pixel_planes import widest
 from geogs.mesh.volume.tsdf import BLOCK, BlockBox, SparseTsdf, blocks_seen, meets_frustum
 from geogs.threads import on_one_torch_thread
 
@@ -36,9 +36,7 @@ class MeshBlock:
 
 def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a view lies, with its band."""
-    valid = view.valid() & (view.depth <= plan.max_depth)
-    T_cw = view.T_cw.to(view.depth.device, torch.float64)
-    planes = PixelPlanes.of(view.depth.float(), valid, view.camera).grown(T_cw, plan.contraction)
+    planes, T_cw = pixel_planes(view, plan)
     return blocks_seen(planes, T_cw, plan.voxel, plan.truncation, plan.contraction)
 
 
@@ -75,7 +73,8 @@ def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> b
     """Whether a view may change a voxel of a box; other views need not be fused there."""
     side = plan.voxel * BLOCK
     low, high = (np.array(c, dtype=np.float64) for c in (box.low, box.high))
-    middle, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
+    middle = (low + high + 1) * side / 2
+    radius = float(np.linalg.norm(high + 1 - low)) * side / 2
     centre, reach = plan.contraction.balls(torch.from_numpy(middle)[None], radius)
     point = centre @ T_cw[:3, :3].double().mT + T_cw[:3, 3].double()
     band = math.inf if plan.contraction else widest(plan.truncation * plan.voxel)

@@ -1,5 +1,7 @@
 """Cleaning of an extracted mesh on its device: specks removed, small holes closed."""
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -7,7 +9,6 @@ from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.holes import IsFree, closing_fans
 from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import Mesh
 
@@ -16,6 +17,9 @@ LEAST_OF_LARGEST = 2e-4
 a sign has less than a thousandth of the faces of a road with its fronts, which are one part."""
 CLOSED_HOLES = 8
 """Most edges of a hole that is closed, unless a ray crosses it."""
+
+IsFree = Callable[[Float[np.ndarray, "k 3"]], Bool[np.ndarray, "k"]]
+"""Function that returns whether points lie in space that was seen to be free."""
 
 
 def cleaned(
@@ -26,9 +30,11 @@ def cleaned(
     Raises InputError if no surface is left.
     """
     mesh = large_components(
-        without_degenerate_faces(mesh), config.min_component_faces, LEAST_OF_LARGEST,
+        without_degenerate_faces(mesh),
+        config.min_component_faces,
+        LEAST_OF_LARGEST,
         config.max_components,
-    )  # fmt: skip
+    )
     if not len(mesh.faces):
         raise InputError(
             f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
@@ -67,7 +73,8 @@ def without_degenerate_faces(mesh: TensorMesh) -> TensorMesh:
 
 
 def _have_areas(mesh: TensorMesh) -> Bool[Tensor, "m"]:
-    areas, squares = [], []
+    areas = []
+    squares = []
     for _, u, v in mesh.sides():
         areas.append(torch.linalg.cross(u, v).square().sum(-1))
         squares.append(u.square().sum() + v.square().sum() + (v - u).square().sum())
@@ -117,7 +124,8 @@ def components_on_host(mesh: TensorMesh) -> Int[Tensor, "n"]:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    faces, n = mesh.faces.numpy(), len(mesh.vertices)
+    faces = mesh.faces.numpy()
+    n = len(mesh.vertices)
     a, b = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
     return torch.from_numpy(connected_components(links, directed=False)[1])
@@ -125,7 +133,9 @@ def components_on_host(mesh: TensorMesh) -> Int[Tensor, "n"]:
 
 def border_edges(mesh: TensorMesh) -> Int[Tensor, "e 2"]:
     """Edges (start, end) of faces that no face has in the other direction, unordered."""
-    start, end, count = mesh.faces, mesh.faces.roll(-1, 1), len(mesh.vertices)
+    start = mesh.faces
+    end = mesh.faces.roll(-1, 1)
+    count = len(mesh.vertices)
     keys = 2 * (torch.minimum(start, end) * count + torch.maximum(start, end)) + (start > end)
     keys = keys.flatten().sort().values.unique_consecutive()
     alone = torch.ones_like(keys, dtype=torch.bool)
@@ -133,7 +143,9 @@ def border_edges(mesh: TensorMesh) -> Int[Tensor, "e 2"]:
     alone[1:] &= ~is_pair
     alone[:-1] &= ~is_pair
     keys = keys[alone]
-    low, high, turned = keys // 2 // count, keys // 2 % count, keys % 2 == 1
+    low = keys // 2 // count
+    high = keys // 2 % count
+    turned = keys % 2 == 1
     edges = torch.stack([torch.where(turned, high, low), torch.where(turned, low, high)], -1)
     return edges[low != high]
 
@@ -147,14 +159,61 @@ def with_closed_holes(
     A hole stays open if its middle is free, or if the fan would fold over: such a border is a real
     end of the surface, not a gap.
     """
-    vertices, normals, device = mesh.vertices, mesh.normals(), mesh.faces.device
-
-    def look(loops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    device = mesh.faces.device
+    count = len(mesh.vertices)
+    vertices = [mesh.vertices]
+    normals = [mesh.normals()]
+    faces = [mesh.faces]
+    for loops in border_loops(border_edges(mesh).cpu().numpy(), most_edges):
         index = torch.from_numpy(loops).to(device)
-        return vertices[index].cpu().numpy(), normals[index].cpu().numpy()
+        corners = vertices[0][index].cpu().numpy().astype(np.float64)
+        middle = corners.mean(axis=1)
+        up = normals[0][index].cpu().numpy().astype(np.float64).sum(axis=1)
+        closed = np.flatnonzero(_are_flat(corners, middle, up))
+        closed = closed[~is_free(middle[closed])]
+        number = np.broadcast_to(count + np.arange(len(closed))[:, None], loops[closed].shape)
+        turned = np.roll(loops[closed], -1, axis=1)
+        fans = np.stack([loops[closed], turned, number], -1).reshape(-1, 3)
+        length = np.linalg.norm(up[closed], axis=1, keepdims=True)
+        faces.append(torch.from_numpy(fans).to(device))
+        vertices.append(torch.from_numpy(middle[closed].astype(np.float32)).to(device))
+        normals.append(torch.from_numpy((up[closed] / length).astype(np.float32)).to(device))
+        count += len(closed)
+    return TensorMesh(torch.cat(vertices), torch.cat(faces)), torch.cat(normals)
 
-    border = border_edges(mesh).cpu().numpy()
-    fans = closing_fans(border, len(vertices), look, most_edges, is_free)
-    middle, up, faces = (torch.from_numpy(part).to(device) for part in fans)
-    mesh = TensorMesh(torch.cat([vertices, middle]), torch.cat([mesh.faces, faces]))
-    return mesh, torch.cat([normals, up])
+
+def border_loops(
+    border: Int[np.ndarray, "e 2"], most_edges: int
+) -> Iterator[Int[np.ndarray, "n k"]]:
+    """Closed chains of three to ``most_edges`` edges that one face has, against their direction.
+
+    Chains of the same number of edges come together, each from its lowest vertex on. Chains through
+    a vertex where two borders meet are left out.
+    """
+    ends, first, counts = np.unique(border[:, 1], return_index=True, return_counts=True)
+    ends = ends[counts == 1]
+    starts = border[first[counts == 1], 0]
+    place = np.searchsorted(ends, starts).clip(max=max(len(ends) - 1, 0))
+    # One more index, to which open chains lead, leads to itself.
+    following = np.append(np.where(ends[place] == starts, place, len(ends)), len(ends))
+    paths = np.arange(len(ends))[:, None]
+    for edges in range(1, most_edges + 1):
+        last = following[paths[:, -1]]
+        is_closed = last == paths[:, 0]
+        if edges >= 3 and is_closed.any():
+            yield ends[paths[is_closed]]
+        # A loop is followed from its lowest vertex alone.
+        goes_on = ~is_closed & (last > paths[:, 0]) & (last < len(ends))
+        paths = np.column_stack([paths[goes_on], last[goes_on]])
+
+
+def _are_flat(
+    corners: Float[np.ndarray, "n k 3"],
+    middle: Float[np.ndarray, "n 3"],
+    up: Float[np.ndarray, "n 3"],
+) -> Bool[np.ndarray, "n"]:
+    """Whether all triangles of a fan turn the same side up as the surface around."""
+    normals = np.cross(np.roll(corners, -1, axis=1) - corners, middle[:, None] - corners)
+    length = np.linalg.norm(normals, axis=-1) * np.linalg.norm(up, axis=-1)[:, None]
+    turn = (normals * up[:, None]).sum(-1)
+    return np.asarray(((turn > 0.2 * length) & (length > 0)).all(axis=1))

@@ -1,7 +1,7 @@
 """Vertex colours from the images of the views."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,7 +14,8 @@ from geogs.geometry.neighbors import nearest_neighbors
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread, thread_map
 
-_GREY = 128
+GREY = 128
+"""Level of the colour of a surface that no view shows."""
 SLACK = 0.02
 """Fraction of the depth by which a vertex may be off a view's depth, besides the tolerance."""
 LEAST_COSINE = 0.05
@@ -24,11 +25,7 @@ _SPAN = 32768
 
 
 @on_one_torch_thread
-def colour_mesh(
-    mesh: Mesh,
-    views: Sequence[DepthMapView],
-    tolerance: float,
-) -> Mesh:
+def colour_mesh(mesh: Mesh, views: Sequence[DepthMapView], tolerance: float) -> Mesh:
     """Give each vertex the mean colour of the images that see it, by :func:`seen_colours`.
 
     A vertex that no view sees takes the colour of the nearest one that is seen, grey if there is
@@ -60,27 +57,46 @@ def seen_colours(
     add = add_compiled if compiled else add_reference
     for number, view in enumerate(views):
         if view.image is not None:
-            add(_SeenImage.of(view, tolerance, vertices), vertices, normals, total, weight)
+            add(view, tolerance, vertices, normals, total, weight)
         if progress:
             progress(number + 1, len(views))
     return total / torch.where(weight > 0, weight, 1.0)[:, None], weight > 0
 
 
 def add_reference(
-    seen: "_SeenImage",
+    view: DepthMapView,
+    tolerance: float,
     vertices: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
     total: Float[Tensor, "n 3"],
     weight: Float[Tensor, "n"],
 ) -> None:
     """Add the weighted colours that a view gives, and their weights, in place: on any device."""
-    index, w, colour = seen.observe(vertices, normals)
-    total.index_add_(0, index, w[:, None] * colour)
-    weight.index_add_(0, index, w)
+    camera = view.camera
+    T_cw = view.T_cw.to(vertices)
+    points = transform(T_cw, vertices)
+    pixels, z = camera.project(points)
+    column, row = pixels.round().long().unbind(-1)
+    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    index = inside.nonzero()[:, 0]
+    depth = _depth(view).to(vertices.device)[row[index], column[index]]
+    z = z[index]
+    on_surface = (depth - z).abs() < tolerance + SLACK * z
+    index = index[on_surface]
+    z = z[on_surface]
+    ray = torch.nn.functional.normalize(points[index], dim=-1)
+    cosine = -(ray * (normals[index] @ T_cw[:3, :3].mT)).sum(-1)
+    front = cosine > LEAST_COSINE
+    index = index[front]
+    gain = (cosine[front] / z[front]) ** 2
+    image = torch.from_numpy(view.rgb()).to(vertices.device).permute(2, 0, 1).float()
+    total.index_add_(0, index, gain[:, None] * _sample(image, camera, pixels[index]))
+    weight.index_add_(0, index, gain)
 
 
 def add_compiled(
-    seen: "_SeenImage",
+    view: DepthMapView,
+    tolerance: float,
     vertices: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
     total: Float[Tensor, "n 3"],
@@ -89,58 +105,33 @@ def add_compiled(
     """:func:`add_reference` by compiled loops, for float32 tensors on the CPU."""
     from geogs.mesh.colour_kernels import add_colours
 
-    f, camera, n = np.float32, seen.camera, len(vertices)
-    T = np.ascontiguousarray(seen.T_cw.numpy()[:3], np.float32)
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-    places, facing, depth = (
-        np.ascontiguousarray(x.numpy(), np.float32) for x in (vertices, normals, seen.depth)
+    count = len(vertices)
+    camera = view.camera
+    T = view.T_cw.to(vertices)[:3]
+    places, facing, pose, depth = (
+        np.ascontiguousarray(x.cpu().numpy(), np.float32)
+        for x in (vertices, normals, T, _depth(view))
     )
-    image, sums, weights = np.ascontiguousarray(seen.image), total.numpy(), weight.numpy()
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    reach = np.float32(tolerance)
+    slack = np.float32(SLACK)
+    least = np.float32(LEAST_COSINE)
+    image = np.ascontiguousarray(view.rgb())
+    sums = total.numpy()
+    weights = weight.numpy()
 
     def some(start: int) -> None:
+        end = min(start + _SPAN, count)
         add_colours(
-            start, min(start + _SPAN, n), places, facing, T, lens, depth, image,
-            f(seen.tolerance), f(SLACK), f(LEAST_COSINE), sums, weights,
-        )  # fmt: skip
+            start, end, places, facing, pose, lens, depth, image, reach, slack, least, sums, weights
+        )
 
-    thread_map(some, range(0, n, _SPAN))
+    thread_map(some, range(0, count, _SPAN))
 
 
-@dataclass(frozen=True)
-class _SeenImage:
-    """A view that gives colours, on the device of the vertices."""
-
-    camera: Camera
-    T_cw: Float[Tensor, "4 4"]
-    depth: Float[Tensor, "h w"]
-    """Depth; infinite where unknown."""
-    image: UInt8[np.ndarray, "ih iw 3"]
-    tolerance: float
-
-    @staticmethod
-    def of(view: DepthMapView, tolerance: float, vertices: Tensor) -> "_SeenImage":
-        depth = torch.where(view.valid(), view.depth, torch.inf).to(vertices.device)
-        return _SeenImage(view.camera, view.T_cw.to(vertices), depth, view.rgb(), tolerance)
-
-    def observe(
-        self, vertices: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-    ) -> tuple[Tensor, Float[Tensor, "k"], Float[Tensor, "k 3"]]:
-        """Indices, weights and colours (0 to 255) of the vertices that the view sees."""
-        points = transform(self.T_cw, vertices)
-        pixels, z = self.camera.project(points)
-        column, row = pixels.round().long().unbind(-1)
-        width, height = self.camera.width, self.camera.height
-        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        index = inside.nonzero()[:, 0]
-        depth, z = self.depth[row[index], column[index]], z[index]
-        on_surface = (depth - z).abs() < self.tolerance + SLACK * z
-        index, z = index[on_surface], z[on_surface]
-        ray = torch.nn.functional.normalize(points[index], dim=-1)
-        cosine = -(ray * (normals[index] @ self.T_cw[:3, :3].mT)).sum(-1)
-        front = cosine > LEAST_COSINE
-        index, weight = index[front], (cosine[front] / z[front]) ** 2
-        image = torch.from_numpy(self.image).to(vertices.device).permute(2, 0, 1).float()
-        return index, weight, _sample(image, self.camera, pixels[index])
+def _depth(view: DepthMapView) -> Float[Tensor, "h w"]:
+    """Depth of a view; infinite where unknown."""
+    return torch.where(view.valid(), view.depth, torch.inf)
 
 
 def _sample(
@@ -165,7 +156,7 @@ def filled(
     if bool(seen.all()):
         return colours
     if not bool(seen.any()):
-        return torch.full_like(colours, _GREY)
+        return torch.full_like(colours, GREY)
     _, nearest = nearest_neighbors(vertices[~seen], vertices[seen], 1)
     colours[~seen] = colours[seen][nearest[:, 0]]
     return colours

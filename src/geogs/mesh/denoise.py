@@ -32,9 +32,11 @@ def denoised(
     start = vertices.double()
     if reach <= 0 or not len(faces):
         return start
-    faces, count = faces.long(), len(start)
+    faces = faces.long()
+    count = len(start)
     before, area = _facets(start, faces)
-    normal, beyond = before, faces_beyond(faces)
+    normal = before
+    beyond = faces_beyond(faces)
     for _ in range(_NORMAL_ROUNDS):
         normal = _mean_of_neighbours(normal, area, beyond)
     weight = vertex_sums(area, faces, count).clamp(min=1e-300)
@@ -57,7 +59,8 @@ def faces_beyond(faces: Int[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
     first = (sides.cumsum(0) - sides)[sides == 2]
     one, other = order[first], order[first + 1]
     beyond = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
-    beyond[one], beyond[other] = other // 3, one // 3
+    beyond[one] = other // 3
+    beyond[other] = one // 3
     return beyond.view(-1, 3)
 
 

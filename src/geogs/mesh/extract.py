@@ -17,12 +17,21 @@ from geogs.mesh.decimation.decimate import merged
 from geogs.mesh.denoise import denoised
 from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.volume.block_count import fitting, fitting_voxel
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
-from geogs.mesh.volume.device_marching import device_surface
 from geogs.mesh.volume.free_space import FreeSpace
-from geogs.mesh.volume.level_set import extract_surface
-from geogs.mesh.volume.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
+from geogs.mesh.volume.level_set import device_surface, extract_surface
+from geogs.mesh.volume.pixel_planes import PixelPlanes
+from geogs.mesh.volume.tsdf import (
+    BLOCK,
+    BYTES_PER_BLOCK,
+    HALF,
+    LIMIT,
+    SparseTsdf,
+    band_blocks,
+    footprint_points,
+    pack,
+    unpack,
+)
 from geogs.threads import on_one_torch_thread
 
 _log = logging.getLogger(__name__)
@@ -33,11 +42,9 @@ _MOST_OUT_OF_REACH = 0.05
 _CROWDED = 0.1
 """Fraction of the memory limit, estimated from a sample of the pixels, above which the blocks of
 all pixels are counted: a scattered surface, as outdoors, has several times as many."""
-_NEAR = 0.1
-"""Fraction of the pixels that count as the nearest."""
 _COARSEST = 4.0
-"""Largest ratio of the voxel to the footprint of those pixels, if there is room for smaller ones: a
-background may fill most of the image behind near surfaces."""
+"""Largest ratio of the voxel to the footprint of the nearest tenth of the pixels, if there is room
+for smaller ones: a background may fill most of the image behind near surfaces."""
 _AROUND = 0.95
 """Quantile of the distances of cameras and of surface from the middle."""
 _FAR = 4.0
@@ -46,7 +53,11 @@ is a background, which is contracted."""
 _OVERRUN = 1.5
 """Factor on the memory limit that a volume may take, as the plan may be from a sample."""
 _COARSER = 1.5
-"""Growth of the voxels from one trial to the next."""
+"""Growth of the voxels from one fusion to the next."""
+_SLIGHTLY_COARSER = 1.1
+"""Growth of the voxels from one count of the blocks to the next."""
+_CELLS_PER_BLOCK = 3
+"""Half blocks with surface, per block that fits, above which voxels are certainly too small."""
 _FACES_PER_SQUARE = 2.4
 """Approximate number of triangles of marching cubes per voxel face of surface."""
 
@@ -92,18 +103,19 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     if not len(depths):
         raise InputError("No depth map has a valid pixel, so there is no surface to extract.")
     max_depth = 2 * float(depths.quantile(0.95))
-    voxel = float(min(footprints.median(), _COARSEST * footprints.quantile(_NEAR)))
+    voxel = float(min(footprints.median(), _COARSEST * footprints.quantile(0.1)))
     near = float(depths[footprints <= voxel].amax())
     points = points[depths <= max_depth]
     contraction = _contraction([view.T_cw for view in sampled], points, near)
     points = contraction.contracted(points)
     if config.voxel is not None:
-        voxel, blocks = config.voxel, _blocks_of_given_voxel(points, config.voxel, config)
+        voxel = config.voxel
+        blocks = _blocks_of_given_voxel(points, config.voxel, config)
         faces = _FACES_PER_SQUARE * _area(points, voxel)
     else:
         faces = _FACES_PER_SQUARE * _area(points, voxel)
         voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
-        voxel, blocks = fitting(points, voxel, config.truncation, _most_blocks(config))
+        voxel, blocks = _fitting(points, voxel, config.truncation, _most_blocks(config))
     triangles = round(faces / voxel**2)
     return VolumePlan(voxel, config.truncation, max_depth, blocks, triangles, contraction)
 
@@ -163,81 +175,111 @@ def extract_mesh(
             )
         plan = replace(plan, voxel=_COARSER * plan.voxel)
         _log.info("too large: voxel %.4g", plan.voxel)
-    found, is_free = _level_set(tsdf, config)
+    extract = extract_surface if tsdf.device.type == "cpu" else device_surface
+    found = extract(tsdf, config.min_weight)
+    is_free = FreeSpace.of(tsdf, config.min_weight)
     del tsdf  # takes most of the memory
-    clean, normals = cleaned(found, config, is_free)
-    surface = _Surface(clean.vertices, clean.faces.to(torch.int32), normals)
+    surface, normals = cleaned(found, config, is_free)
     seen = None
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
-        world = surface.expanded(plan.contraction)
-        seen = seen_colours(world.vertices, world.normals, views, 2 * plan.voxel, report)
+        world = _expanded(surface, normals, plan.contraction)
+        seen = seen_colours(*world, views, 2 * plan.voxel, report)
         del world
     if progress:
         progress("merge", 0, 1)
-    mesh = _merged_mesh(surface, seen, config, plan)
+    mesh = _merged_mesh(surface, normals, seen, config, plan)
     if progress:
         progress("merge", 1, 1)
     return mesh
 
 
 def _counted(plan: VolumePlan, views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
-    """The plan with all pixels of all views counted."""
-    voxel, blocks = fitting_voxel(
-        views, plan.voxel, plan.truncation, plan.max_depth, _most_blocks(config), plan.contraction
-    )
+    """The plan with all pixels of all views counted.
+
+    A sample of the pixels suffices for a surface that many of them see. A scattered surface, such
+    as trees and the far end of an outdoor view, has further blocks for each further pixel.
+    """
+    voxel, blocks = fitting_voxel(views, plan, _most_blocks(config))
     triangles = round(plan.triangles * (plan.voxel / voxel) ** 2)
     return replace(plan, voxel=voxel, blocks=blocks, triangles=triangles)
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """A surface on the device where it was fused."""
-
-    vertices: Float[Tensor, "n 3"]
-    faces: Int[Tensor, "m 3"]
-    """Vertices of each face, int32."""
-    normals: Float[Tensor, "n 3"]
-
-    def expanded(self, contraction: Contraction) -> "_Surface":
-        """The surface transformed from contracted space to the world."""
-        if not contraction:
-            return self
-        return _Surface.of(contraction.expanded(self.vertices), self.faces)
-
-    @staticmethod
-    def of(vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> "_Surface":
-        """Make a surface with the normals of its faces."""
-        return _Surface(vertices, faces, TensorMesh(vertices, faces.long()).normals())
+def fitting_voxel(views: Sequence[DepthMapView], plan: VolumePlan, most: int) -> tuple[float, int]:
+    """The planned voxel, or the least one larger by steps of 10 %, with which ``most`` blocks hold
+    the surface of all views with its band; and the number of blocks."""
+    voxel = plan.voxel
+    cells = torch.empty(0, dtype=torch.long, device=views[0].depth.device)
+    for view in views:
+        planes, T_cw = pixel_planes(view, plan)
+        points = footprint_points(planes, T_cw, voxel, plan.contraction)
+        cells = torch.unique(torch.cat([cells, _half_blocks(points, voxel)]))
+        while len(cells) > _CELLS_PER_BLOCK * most:
+            points = _centres(cells, voxel)
+            voxel *= _SLIGHTLY_COARSER
+            cells = torch.unique(_half_blocks(points, voxel))
+    return _fitting(_centres(cells, voxel), voxel, plan.truncation, most)
 
 
-def _level_set(tsdf: SparseTsdf, config: MeshConfig) -> tuple[TensorMesh, FreeSpace]:
-    """The surface in a volume, and its free space."""
-    extract = extract_surface if tsdf.device.type == "cpu" else device_surface
-    return extract(tsdf, config.min_weight), FreeSpace.of(tsdf, config.min_weight)
+def _fitting(
+    points: Float[Tensor, "n 3"], voxel: float, truncation: float, most: int
+) -> tuple[float, int]:
+    """:func:`fitting_voxel` for a surface sampled by points of contracted space."""
+    while (blocks := len(band_blocks(points, voxel, truncation))) > most:
+        voxel *= _SLIGHTLY_COARSER
+    return voxel, blocks
+
+
+def pixel_planes(view: DepthMapView, plan: VolumePlan) -> tuple[PixelPlanes, Float[Tensor, "4 4"]]:
+    """Planes of the pixels of a view up to the planned depth, and its pose on their device."""
+    valid = view.valid() & (view.depth <= plan.max_depth)
+    T_cw = view.T_cw.to(view.depth.device, torch.float64)
+    planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
+    return planes.grown(T_cw, plan.contraction), T_cw
+
+
+def _half_blocks(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:
+    """Keys of the half blocks that points lie in, except those out of the volume's reach."""
+    cells = torch.floor(points / (voxel * HALF)).long()
+    return pack(cells[(cells.abs() < LIMIT // HALF).all(-1)])
+
+
+def _centres(cells: Int[Tensor, "n"], voxel: float) -> Float[Tensor, "n 3"]:
+    return (unpack(cells).double() + 0.5) * (voxel * HALF)
+
+
+def _expanded(
+    mesh: TensorMesh, normals: Float[Tensor, "n 3"], contraction: Contraction
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Vertices and normals of a mesh of contracted space in the world."""
+    if not contraction:
+        return mesh.vertices, normals
+    world = TensorMesh(contraction.expanded(mesh.vertices), mesh.faces)
+    return world.vertices, world.normals()
 
 
 def _merged_mesh(
-    surface: _Surface, seen: tuple[Tensor, Tensor] | None, config: MeshConfig, plan: VolumePlan
+    surface: TensorMesh,
+    normals: Float[Tensor, "n 3"],
+    seen: tuple[Tensor, Tensor] | None,
+    config: MeshConfig,
+    plan: VolumePlan,
 ) -> Mesh:
     """Decimate and smooth a surface in contracted space; return it in the world and on the host,
     with the colours of the vertices that were seen.
 
     Unseen vertices take their colours only now, when there are few.
     """
-    few = merged(surface.vertices, surface.faces, config.detail * plan.voxel)
+    few = merged(surface.vertices, surface.faces.to(torch.int32), config.detail * plan.voxel)
     if few is not None:
         vertices = denoised(few.position, few.faces, config.smoothing * plan.voxel).float()
-        surface = _Surface.of(vertices, few.faces)
+        surface = TensorMesh(vertices, few.faces.long())
+        normals = surface.normals()
         seen = None if seen is None else few.means(*seen)
     colours = None if seen is None else filled(surface.vertices, *seen).cpu().numpy()
-    world = surface.expanded(plan.contraction)
-    return Mesh(
-        world.vertices.cpu().numpy(),
-        world.faces.cpu().numpy(),
-        world.normals.cpu().numpy(),
-        colours,
-    )
+    vertices, normals = _expanded(surface, normals, plan.contraction)
+    faces = surface.faces.to(torch.int32)
+    return Mesh(vertices.cpu().numpy(), faces.cpu().numpy(), normals.cpu().numpy(), colours)
 
 
 def fuse(
@@ -271,7 +313,9 @@ def _sample_points(
     views: Sequence[DepthMapView],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Depths, pixel footprints and world points of a regular subset of all pixels."""
-    depths, footprints, points = [], [], []
+    depths = []
+    footprints = []
+    points = []
     step = 0
     for view in views:
         if not step:  # a view may be rendered on access; they are of one size

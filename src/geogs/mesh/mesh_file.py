@@ -28,7 +28,8 @@ def read_mesh(path: Path) -> Mesh:
     ):
         raise InputError(f"{path} has faces that are no triangles of its vertices.")
     faces = faces.reshape(-1, 3).astype(np.int32)
-    normals, colours = vertex_normals(vertices, faces), None
+    normals = vertex_normals(vertices, faces)
+    colours = None
     if {"nx", "ny", "nz"} <= vertex.columns.keys():
         normals = _rows(vertex, ("nx", "ny", "nz"), np.float32)
     if {"red", "green", "blue"} <= vertex.columns.keys():

@@ -102,9 +102,12 @@ class Mesh(ShortRepr):
         except ImportError:
             raise InputError("trimesh is missing; pip install trimesh brings it.") from None
         return trimesh.Trimesh(
-            self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=self.colours,
+            self.vertices,
+            self.faces,
+            vertex_normals=self.normals,
+            vertex_colors=self.colours,
             process=False,
-        )  # fmt: skip
+        )
 
 
 def vertex_normals(

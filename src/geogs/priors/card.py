@@ -114,20 +114,21 @@ def load_card(name: str) -> PriorCard:
 
 
 def _from_settings(name: str, content: dict[Any, Any]) -> PriorCard:
-    known, said = dict(kinds(PriorCard)), {}
+    known = dict(kinds(PriorCard))
+    settings = {}
     for key, value in content.items():
         if key not in known:
             raise InputError(
                 f"The card {name} has a setting {str(key)[:40]!r}, which does not exist."
             )
-        said[key] = _value(known[key], value)
-        if not known[key].allows(said[key]):
+        settings[key] = _value(known[key], value)
+        if not known[key].allows(settings[key]):
             raise InputError(f"The card {name} is wrong: {key} must be {known[key]}.")
     required = (f.name for f in fields(PriorCard) if f.default is MISSING)
-    if missing := [key for key in required if key not in said]:
+    if missing := [key for key in required if key not in settings]:
         raise InputError(f"The card {name} does not say {', '.join(missing)}.")
     try:
-        return PriorCard(**said)
+        return PriorCard(**settings)
     except InputError as error:
         raise InputError(f"The card {name} is wrong: {error}") from None
 

@@ -30,15 +30,11 @@ LATERAL = 0.5
 """Lateral error of a depth, pixels of the working image."""
 EDGE = 0.04
 """Relative step of depth between neighbouring pixels that is an edge."""
-NEAR, FAR = 0.1, 10.0
-"""Range of depths, metres: sensors measure hardly anything nearer or farther."""
 _EVERYWHERE = np.ones((3, 3), np.uint8)
 _STEPS = 4.0
 """Least step at an edge in standard deviations of the sensor."""
 INDEPENDENT = 9.0
 """Effective number of independent measurements in 25 neighbouring pixels."""
-_MARGIN = 1
-"""Pixels beside a hole or an edge that are dropped."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +75,6 @@ class SensorDepth:
         The deviation is the pixels' own: their common error does not average out.
         """
         known = (self.inverse_depth > 0).astype(np.float32)
-        if (width, height) == known.shape[::-1]:
-            return self
         fraction, inverse, deviation = (
             cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA)
             for m in (known, self.inverse_depth, np.where(known > 0, self.deviation, 0))
@@ -105,7 +99,7 @@ class SensorDepth:
 
 def sensor_depth(metres: Float32[np.ndarray, "h w"], config: DepthSensorConfig) -> SensorDepth:
     """Inverse depth and its deviation from a depth image z, 0 where the sensor saw nothing."""
-    known = (metres >= NEAR) & (metres <= FAR)
+    known = (metres >= 0.1) & (metres <= 10.0)  # sensors measure hardly anything beyond
     z = np.where(known, metres, 1.0).astype(np.float32)
     d = np.where(known, 1 / z, 0).astype(np.float32)
     # Holes neither make a step nor a gradient: the pixels around stand for them.
@@ -113,9 +107,10 @@ def sensor_depth(metres: Float32[np.ndarray, "h w"], config: DepthSensorConfig) 
     lowest = cv2.erode(np.where(known, d, np.float32(1e6)), _EVERYWHERE)
     step = np.where(known, highest - lowest, 0)
     is_edge = step > 2 * np.maximum(EDGE * d, _STEPS * np.float32(config.deviation))
-    bad = cv2.dilate((is_edge | ~known).astype(np.uint8), _EVERYWHERE, iterations=_MARGIN) > 0
+    bad = cv2.dilate((is_edge | ~known).astype(np.uint8), _EVERYWHERE) > 0
     gradient = np.hypot(_slope(d, known, 1), _slope(d, known, 0))
-    ratio, lateral = np.float32(config.ratio), np.float32(LATERAL)
+    ratio = np.float32(config.ratio)
+    lateral = np.float32(LATERAL)
     variance = config.deviation**2 + (ratio * d) ** 2 + (lateral * gradient) ** 2
     return SensorDepth(
         np.where(bad, 0, d).astype(np.float32),

@@ -16,8 +16,6 @@ FIT = 16.8
 """Largest squared normalised difference (six degrees of freedom) of motions that fit: 99 %."""
 PROPOSALS = 256
 """Most scales that are tried, evenly chosen along the path."""
-ROUNDS = 10
-"""Rounds of reweighting."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +44,7 @@ def information_of(motion: Float[Tensor, "m 4 4"], config: OdometryConfig) -> Fl
 
 
 def vote_on_scale(
-    seen: Float[Tensor, "m 4 4"],
-    measured: Float[Tensor, "m 4 4"],
-    config: OdometryConfig,
+    seen: Float[Tensor, "m 4 4"], measured: Float[Tensor, "m 4 4"], config: OdometryConfig
 ) -> ScaleVote:
     """The scale at which most motions seen in the images fit those that were measured in metres.
 
@@ -75,8 +71,7 @@ def vote_on_scale(
         return ScaleVote(1.0, math.inf, torch.zeros(len(t), dtype=torch.bool))
     support = (1 / (1 + misfit(proposals) / FIT)).sum(1)
     scale = proposals[support.argmax()]
-    weight = precision
-    for _ in range(ROUNDS):
+    for _ in range(10):
         weight = precision / (1 + misfit(scale) / FIT) ** 2
         scale = (weight * (t * t_measured).sum(1)).sum() / (weight * lengths.square()).sum()
     fits = misfit(scale) <= FIT

@@ -1,15 +1,16 @@
 """Initial disks: in local planes (paper, Sec. "Local-plane driven initialization") or random."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.config import DiskConfig
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
-from geogs.splat.cuda.local_planes import principal_planes
+from geogs.gpu.kernels import kernels_for
 from geogs.world.disks import DiskParameters
 
 NEIGHBOURS = 12
@@ -20,6 +21,8 @@ MIN_COSINE = 0.15
 _LEAST_SCALE = 1e-7
 # Margin around some points, relative to their extent, in which neighbours are searched first.
 _MARGIN = 0.05
+_SOURCE = Path(__file__).parent / "cuda" / "local_planes.cu"
+_BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -50,12 +53,9 @@ def fit_local_planes(
     eigenvalues, vectors = torch.linalg.eigh(centred.mT @ centred)
     low, middle, high = eigenvalues.clamp(min=0).unbind(-1)
     spacing = distances[:, 1:4].square().mean(1).sqrt()
-    return LocalPlane(
-        normal=vectors[..., 0].to(points.dtype),
-        tangent=vectors[..., 2].to(points.dtype),
-        planarity=((middle - low) / high.clamp(min=1e-30)).to(points.dtype),
-        spacing=spacing.to(points.dtype),
-    )
+    planarity = (middle - low) / high.clamp(min=1e-30)
+    found = (vectors[..., 0], vectors[..., 2], planarity, spacing)
+    return LocalPlane(*(values.to(points.dtype) for values in found))
 
 
 def _neighbourhoods(
@@ -160,3 +160,22 @@ def random_disks(
     scale = spacing.clamp(min=_LEAST_SCALE).log()[:, None].expand(-1, 2).clone()
     logit = torch.logit(points.new_full((count,), opacity))
     return DiskParameters(points, quaternion, scale, logit)
+
+
+def principal_planes(
+    points: Float[Tensor, "m 3"], neighbours: Int[Tensor, "n k"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Normal, tangent, planarity and spacing of each neighbourhood; see ``LocalPlane``.
+
+    ``neighbours`` are indices (int64) of ``points`` (float32), nearest first, beginning with the
+    point itself. Computed in float64: Jacobi's method on the 3 x 3 scatter matrices.
+    """
+    n, k = neighbours.shape
+    normal = points.new_empty(n, 3)
+    tangent = points.new_empty(n, 3)
+    planarity = points.new_empty(n)
+    spacing = points.new_empty(n)
+    kernel = kernels_for(_SOURCE, points.device)["local_planes"]
+    blocks = (n + _BLOCK - 1) // _BLOCK
+    kernel(blocks, _BLOCK, points, neighbours, n, k, normal, tangent, planarity, spacing)
+    return normal, tangent, planarity, spacing

@@ -55,9 +55,8 @@ class MapOptimizer:
         for p, m, v, rate in groups:
             if p.grad is not None:
                 adam_rows(
-                    p, p.grad, m, v, visible, disks.steps, self._corrections,
-                    rate, BETAS, EPSILON,
-                )  # fmt: skip
+                    p, p.grad, m, v, visible, disks.steps, self._corrections, rate, BETAS, EPSILON
+                )
 
 
 def _bias_corrections(beta: float) -> Float[Tensor, "t"]:

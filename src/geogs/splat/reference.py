@@ -7,7 +7,7 @@ backends are tested against it.
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -68,14 +68,7 @@ class PixelValues(NamedTuple):
 
 def render_reference(
     disks: DiskParameters, camera: Camera, T_cw: Float[Tensor, "4 4"], near: float
-) -> tuple[
-    Float[Tensor, "h w"],
-    Float[Tensor, "h w 3"],
-    Float[Tensor, "h w"],
-    Float[Tensor, "h w"],
-    Float[Tensor, "h w"],
-    Bool[Tensor, "n"],
-]:
+) -> tuple[Tensor, ...]:
     """Depth, normal, alpha, distortion, median depth and visibility; see ``render``.
 
     Computed in the dtype and on the device of the positions.
@@ -88,24 +81,18 @@ def render_reference(
     pixels = torch.stack([x.flatten(), y.flatten()], -1)
     step = max(1, _CHUNK_ELEMENTS // max(1, len(projected.rows)))
     if step >= len(pixels):
-        values = blend(projected, pixels, camera, near)
+        *maps, shown = blend(projected, pixels, camera, near)
     else:
         pieces = [
             checkpoint(blend, projected, p, camera, near, use_reentrant=False)
             for p in pixels.split(step)
         ]
-        *maps, seen = zip(*pieces, strict=True)
-        values = PixelValues._make([*map(torch.cat, maps), torch.stack(seen).any(0)])
+        *parts, seen = zip(*pieces, strict=True)
+        maps = [torch.cat(part) for part in parts]
+        shown = torch.stack(seen).any(0)
     visible = torch.zeros(len(disks.position), dtype=torch.bool, device=x.device)
-    visible[projected.rows] = values.visible
-    return (
-        values.depth.view(h, w),
-        values.normal.view(h, w, 3),
-        values.alpha.view(h, w),
-        values.distortion.view(h, w),
-        values.median_depth.view(h, w),
-        visible,
-    )
+    visible[projected.rows] = shown
+    return (*(values.view(h, w, *values.shape[1:]) for values in maps), visible)
 
 
 def project_disks(disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float) -> ProjectedDisks:
@@ -115,7 +102,8 @@ def project_disks(disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float
     whose quaternion is zero, whose log-scale exceeds ``MAX_LOG_SCALE`` or that hold a number that
     is not finite.
     """
-    R, t = T_cw[:3, :3], T_cw[:3, 3]
+    R = T_cw[:3, :3]
+    t = T_cw[:3, 3]
     with torch.no_grad():
         finite = torch.cat([disks.position, disks.quaternion, disks.log_scale], 1).isfinite()
         ok = finite.all(1) & disks.opacity_logit.isfinite() & (disks.quaternion != 0).any(1)
@@ -134,7 +122,8 @@ def project_disks(disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float
     with torch.no_grad():
         z = center[:, 2]
         reach = 3 * (scale * torch.stack([tangent_u[:, 2], tangent_v[:, 2]], -1)).norm(dim=-1)
-        in_front, behind = torch.minimum(reach, z - near), torch.minimum(reach, MAX_REACH_RATIO * z)
+        in_front = torch.minimum(reach, z - near)
+        behind = torch.minimum(reach, MAX_REACH_RATIO * z)
     return ProjectedDisks(
         rows=index,
         center=center,
@@ -158,7 +147,8 @@ def intersect(
     w = 1/c_z + n . delta / (n . c), and the hit lies (delta - c (n . delta) / (n . c)) / w from the
     centre. In the low-pass branch the depth is kept within the disk's own extent.
     """
-    c, z_c = disks.center, disks.center[:, 2]
+    c = disks.center
+    z_c = disks.center[:, 2]
     focal = torch.stack([c.new_tensor(camera.fx), c.new_tensor(camera.fy)])
     principal = torch.stack([c.new_tensor(camera.cx), c.new_tensor(camera.cy)])
     offset = pixels[:, None] - (focal * c[:, :2] / z_c[:, None] + principal)
@@ -173,7 +163,8 @@ def intersect(
         rho3 = rho3 + (z * along / scale) ** 2
     rho2 = 2 * (offset**2).sum(-1)
     on_plane = hits & (rho3 <= rho2)
-    nearest, furthest = z_c - disks.reach[0], z_c + disks.reach[1]
+    nearest = z_c - disks.reach[0]
+    furthest = z_c + disks.reach[1]
     kept = torch.where(w < 1 / furthest, furthest, torch.where(w > 1 / nearest, nearest, z))
     return torch.where(on_plane, rho3, rho2), torch.where(on_plane, z, kept)
 
@@ -191,14 +182,9 @@ def blend(
     total = weight.sum(1)
     depth = (weight * z).sum(1) / torch.where(total > 0, total, torch.ones_like(total))
     normal = weight @ disks.normal
-    return PixelValues(
-        depth=depth,
-        normal=normal,
-        alpha=total,
-        distortion=distortion(weight, z),
-        median_depth=_median(weight.detach(), before, z.detach()),
-        visible=(weight > 0).any(0),
-    )
+    median = _median(weight.detach(), before, z.detach())
+    visible = (weight > 0).any(0)
+    return PixelValues(depth, normal, total, distortion(weight, z), median, visible)
 
 
 def distortion(weight: Float[Tensor, "p n"], z: Float[Tensor, "p n"]) -> Float[Tensor, "p"]:

@@ -68,26 +68,6 @@ class FlowEvidence:
     """b = sum w r . dp/dd; the step of the matches alone is b / C."""
 
 
-@dataclass(frozen=True)
-class ScaledPrior:
-    """Priors of several frames with their present scales."""
-
-    inverse_depth: Float[Tensor, "n p"]
-    """d_prior; 0 where unknown."""
-    scale: Float[Tensor, "n k"]
-    """Scale at each node."""
-    weight: Float[Tensor, "n p"]
-    """alpha, 1 / inverse depth^2; 0 where unknown."""
-
-
-@dataclass(frozen=True)
-class DepthScaleStep:
-    """A step of inverse depths and scales."""
-
-    depth: Float[Tensor, "n p"]
-    scale: Float[Tensor, "n k"]
-
-
 def node_weights(grid: SampleGrid, rows: int, columns: int) -> Float[Tensor, "p k"]:
     """Return the weight B of each node's scale in each cell; rows sum to one."""
     y, x = (_hats(n, k, grid) for n, k in ((grid.height, rows), (grid.width, columns)))
@@ -107,14 +87,16 @@ def node_differences(rows: int, columns: int) -> Float[Tensor, "k k"]:
     j = torch.cat([node[:, :-1].reshape(-1), node[:-1].reshape(-1)])
     D = torch.zeros(len(i), rows * columns)
     edge = torch.arange(len(i))
-    D[edge, i], D[edge, j] = 1.0, -1.0
+    D[edge, i] = 1.0
+    D[edge, j] = -1.0
     return D.mT @ D
 
 
 def flow_evidence(grid: SampleGrid, problem: BundleProblem, huber: float) -> FlowEvidence:
     """Compute curvature and gradient of the matches' term in the inverse depth of every frame."""
     d = problem.inverse_depth
-    curvature, gradient = torch.zeros_like(d), torch.zeros_like(d)
+    curvature = torch.zeros_like(d)
+    gradient = torch.zeros_like(d)
     motion = relative_motion(problem.T_cw, problem.source, problem.target)
     for first in range(0, len(problem.source), EDGES_TOGETHER):
         part = slice(first, first + EDGES_TOGETHER)
@@ -129,40 +111,37 @@ def flow_evidence(grid: SampleGrid, problem: BundleProblem, huber: float) -> Flo
 def depth_scale_step(
     flow: FlowEvidence,
     inverse_depth: Float[Tensor, "n p"],
-    prior: ScaledPrior,
+    prior: Float[Tensor, "n p"],
+    scale: Float[Tensor, "n k"],
+    alpha: Float[Tensor, "n p"],
     basis: Float[Tensor, "p k"],
     stiffness: Float[Tensor, "k k"],
-) -> DepthScaleStep:
-    """Compute the Gauss-Newton step of inverse depths and scales; frames are independent.
+) -> tuple[Float[Tensor, "n p"], Float[Tensor, "n k"]]:
+    """Return the Gauss-Newton step of inverse depths and scales; frames are independent.
 
     Inverse depths are eliminated (Schur). The prior's term then fits the scales to the depth from
     matches, d + b / C, with the weight alpha C / (alpha + C) of the difference of two measurements;
-    it is formed this way, since H - E C'^-1 E^T would cancel. ``stiffness`` is the matrix of the
-    nodes' term for scales of about one.
+    it is formed this way, since H - E C'^-1 E^T would cancel. ``alpha`` is the prior's weight, 0
+    where it is unknown; ``stiffness`` is the matrix of the nodes' term for scales of about one.
     """
-    C, b, alpha = flow.curvature, flow.gradient, prior.weight
-    known = alpha > 0
-    residual = inverse_depth - prior.inverse_depth * (prior.scale @ basis.mT)
-    fit = alpha / (alpha + C).clamp(min=1e-30) * prior.inverse_depth
-    S = _node_products(fit * C * prior.inverse_depth, basis)
-    g = (fit * (C * residual + b)) @ basis
-    S, g = S.double(), g.double()
-    curvature = (alpha * prior.inverse_depth.square()) @ basis.square()
+    C = flow.curvature
+    b = flow.gradient
+    residual = inverse_depth - prior * (scale @ basis.mT)
+    fit = alpha / (alpha + C).clamp(min=1e-30) * prior
+    # sum_u weight(u) B(u) B(u)^T of every frame
+    S = torch.stack([basis.mT @ (w[:, None] * basis) for w in fit * C * prior]).double()
+    g = ((fit * (C * residual + b)) @ basis).double()
+    curvature = (alpha * prior.square()) @ basis.square()
     S = S + torch.diag_embed(SCALE_DAMPING * curvature.double() + 1e-12)
     # Scales differ by fractions of their mean, so that the unit of depth does not matter.
-    relative = stiffness / prior.scale.double().mean(1).square()[:, None, None]
+    relative = stiffness / scale.double().mean(1).square()[:, None, None]
     S = S + relative
-    g = g - (relative @ prior.scale.double()[..., None])[..., 0]
-    scale = torch.linalg.solve(S, g).to(inverse_depth)
+    g = g - (relative @ scale.double()[..., None])[..., 0]
+    scale_step = torch.linalg.solve(S, g).to(inverse_depth)
     damping = DEPTH_DAMPING * C.mean(1, keepdim=True) + 1e-8
-    curved = C + torch.where(known, alpha, damping)
-    rest = residual - prior.inverse_depth * (scale @ basis.mT)
-    return DepthScaleStep((b - alpha * rest) / curved, scale)
-
-
-def _node_products(weight: Float[Tensor, "n p"], basis: Float[Tensor, "p k"]) -> Tensor:
-    """Return sum_u weight(u) B(u) B(u)^T of every frame, (n, k, k)."""
-    return torch.stack([basis.mT @ (w[:, None] * basis) for w in weight])
+    curved = C + torch.where(alpha > 0, alpha, damping)
+    rest = residual - prior * (scale_step @ basis.mT)
+    return (b - alpha * rest) / curved, scale_step
 
 
 @dataclass(frozen=True)
@@ -195,16 +174,16 @@ def adjust_depth(
     stiffness = stiffness / config.scale_step**2
     alpha = _prior_weight(prior, scale, basis, torch.full_like(prior, DEVIATION))
     if config.reject:
-        alpha = _judged(
-            grid, flow, inverse_depth, ScaledPrior(prior, scale, alpha), basis, stiffness
-        )
-    step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, scale, alpha), basis, stiffness)
-    good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
-    good &= (scale + step.scale > 0).all(1, keepdim=True)
+        alpha = _judged(grid, flow, inverse_depth, prior, scale, alpha, basis, stiffness)
+    depth_step, scale_step = depth_scale_step(
+        flow, inverse_depth, prior, scale, alpha, basis, stiffness
+    )
+    good = (torch.isfinite(depth_step).all(1) & torch.isfinite(scale_step).all(1))[:, None]
+    good &= (scale + scale_step > 0).all(1, keepdim=True)
     taken = good & (alpha > 0)  # cells without the prior have just been adjusted to the matches
     return AdjustedDepth(
-        torch.where(taken, (inverse_depth + step.depth).clamp(*LIMITS), inverse_depth),
-        torch.where(good, scale + step.scale, scale),
+        torch.where(taken, (inverse_depth + depth_step).clamp(*LIMITS), inverse_depth),
+        torch.where(good, scale + scale_step, scale),
         torch.where(good, alpha, 0.0),
     )
 
@@ -213,39 +192,39 @@ def _judged(
     grid: SampleGrid,
     flow: FlowEvidence,
     inverse_depth: Float[Tensor, "n p"],
-    good: ScaledPrior,
+    prior: Float[Tensor, "n p"],
+    scale: Float[Tensor, "n k"],
+    alpha: Float[Tensor, "n p"],
     basis: Float[Tensor, "p k"],
     stiffness: Float[Tensor, "k k"],
 ) -> Float[Tensor, "n p"]:
-    """Weight priors by their agreement with the matches, starting from the weights in ``good``."""
-    C, prior, start, alpha = flow.curvature, good.inverse_depth, good.scale, good.weight
+    """Weight priors by their agreement with the matches, starting from weights ``alpha``."""
+    C = flow.curvature
     wanted = inverse_depth + torch.where(C > 0, flow.gradient / C.clamp(min=1e-30), 0.0)
     deviation = torch.full_like(prior, DEVIATION)
     trust = torch.ones_like(prior)
     for _ in range(REWEIGHTINGS):
-        step = depth_scale_step(
-            flow, inverse_depth, ScaledPrior(prior, start, alpha * trust), basis, stiffness
+        _, step = depth_scale_step(
+            flow, inverse_depth, prior, scale, alpha * trust, basis, stiffness
         )
-        fitted = prior * ((start + step.scale) @ basis.mT)
+        factor = (scale + step) @ basis.mT
+        fitted = prior * factor
         known = (prior > 0) & (fitted > 0)
         error = torch.where(known, wanted / fitted.clamp(min=1e-12) - 1, 0.0)
         own = (deviation * fitted).square() + 1 / C.clamp(min=1e-12)
         trust = 1 / (1 + (error * fitted).square() / (_CAUCHY**2 * own))
         confidence = known * C / (C + alpha.clamp(min=1e-12))
         deviation = local_deviation(grid, error, confidence)
-        bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT)
-        deviation = torch.hypot(deviation, bent)
-        alpha = _prior_weight(prior, start, basis, deviation)
+        deviation = torch.hypot(deviation, _ROUGHNESS * roughness(grid, factor))
+        alpha = _prior_weight(prior, scale, basis, deviation)
     overall = _weighted_quantile(error.abs(), confidence, _AGREEING)
     used = (deviation < MAX_DEVIATION) & (overall < MAX_DISAGREEMENT)[:, None]
-    used &= (start + step.scale > 0).all(1, keepdim=True)
+    used &= (scale + step > 0).all(1, keepdim=True)
     return torch.where(used, trust * alpha, 0.0)
 
 
 def local_deviation(
-    grid: SampleGrid,
-    error: Float[Tensor, "n p"],
-    confidence: Float[Tensor, "n p"],
+    grid: SampleGrid, error: Float[Tensor, "n p"], confidence: Float[Tensor, "n p"]
 ) -> Float[Tensor, "n p"]:
     """Estimate the prior's relative deviation in every cell from errors in well-known cells nearby.
 
@@ -287,7 +266,8 @@ def _means_along(field: Float[Tensor, "n h w"], k: int) -> Float[Tensor, "n h w"
     width = field.shape[-1]
     running = F.pad(field.cumsum(-1), (1, 0))
     at = torch.arange(width, device=field.device)
-    first, end = (at - k).clamp(min=0), (at + k + 1).clamp(max=width)
+    first = (at - k).clamp(min=0)
+    end = (at + k + 1).clamp(max=width)
     return (running[..., end] - running[..., first]) / (end - first)
 
 

@@ -54,8 +54,11 @@ class Follower:
         """Pose of the last frame, relative to the copied keyframe."""
         self.frames: list[FollowedFrame] = []
         """Frames located so far, earliest first."""
-        self._locator, self._config = locator, config
-        self._keyframe, self._anchor, self._motion = keyframe, anchor, motion
+        self._locator = locator
+        self._config = config
+        self._keyframe = keyframe
+        self._anchor = anchor
+        self._motion = motion
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
@@ -68,21 +71,21 @@ class Follower:
         That is where the camera is far from its predicted pose, or has moved so far that another
         keyframe is overdue, and after a cut.
         """
-        last, config, keyframe = self.last, self._config, self._keyframe
+        last = self.last
+        locator = self._locator
+        keyframe = self._keyframe
         camera = keyframe.grid.camera
         is_sensed = frame.depth is not None and keyframe.measured is None
         has_size = frame.image.shape[:2] == (camera.height, camera.width)
         if frame.follows_cut or is_sensed or not has_size or len(self.frames) >= MAX_FRAMES:
             return None
-        encoded = self._locator.operator.encode(frame.image)
-        if self._locator.operator.texture(encoded) < MIN_TEXTURE:
+        encoded = locator.operator.encode(frame.image)
+        if locator.operator.texture(encoded) < MIN_TEXTURE:
             return None
-        guess, locator = last.predicted(keyframe, frame.timestamp), self._locator
+        guess = last.predicted(keyframe, frame.timestamp)
         expected = with_depth(locator.locate(keyframe, encoded, guess))
         motion = locator.best(keyframe, encoded, expected)
-        if motion is None:
-            return None
-        if calls_for_keyframe(config, keyframe.grid, motion.seen, patience=PATIENCE):
+        if motion is None or calls_for_keyframe(self._config, keyframe.grid, motion, PATIENCE):
             return None
         velocity = motion.T_cw @ se3_inverse(self.T_cw)
         T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)
@@ -90,7 +93,8 @@ class Follower:
         self.last = LastFrame(
             keyframe.id, T_rel, velocity, keyframe.scale, frame.timestamp, interval
         )
-        self._anchor, self._motion = keyframe, motion
+        self._anchor = keyframe
+        self._motion = motion
         self.frames.append(FollowedFrame(frame, encoded, motion, T_rel))
         return self.frames[-1]
 

@@ -33,10 +33,7 @@ Sizes = Float64[Tensor, "3"]
 
 
 def sizes_of_frames(
-    log: FrameLog,
-    keyframes: KeyframeSet,
-    of_keyframes: Mapping[int, Sizes],
-    varies: VaryingPrior,
+    log: FrameLog, keyframes: KeyframeSet, of_keyframes: Mapping[int, Sizes], varies: VaryingPrior
 ) -> dict[int, Sizes]:
     """Estimate the intrinsics of all located frames, by their indices.
 
@@ -106,7 +103,8 @@ def shifts_of_own(
         own: per-frame intrinsics of each edge's source and target.
     """
     # Exact for any size, except that the shift of the source cell is propagated to first order.
-    (source, target), sizes = own.unbind(1), own.new_zeros(len(own), 2, SHAPES)
+    source, target = own.unbind(1)
+    sizes = own.new_zeros(len(own), 2, SHAPES)
     sizes[:, 0, list(OWN)] = torch.cat([-(-source[:, :1]).expm1(), source[:, 1:]], 1)
     factor = target[:, :1].exp()
     sizes[:, 1, list(OWN)] = torch.cat([target[:, :1].expm1(), factor * target[:, 1:]], 1)
@@ -142,7 +140,8 @@ def _equations(
 ) -> Iterator[tuple[list[int], Float64[Tensor, "e 9 10"]]]:
     """Yield frames, and normal equations of each of their observations with right sides."""
     grid = keyframes.grid
-    cells, own = sparse_cells(grid), list(OWN)
+    cells = sparse_cells(grid)
+    own = list(OWN)
     for part, ids in seen_by_keyframes(log, keyframes):
         frames = [record.index for record, _ in part]
         T, shift = _shifts(keyframes, ids, frames, poses, sizes)

@@ -35,12 +35,15 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     of the camera's unknown motion during readout (:func:`row_twists`). All are independent. Depths
     are those of the keyframes around.
     """
-    log, keyframes = tracker.map.recorder.log, tracker.keyframes
+    log = tracker.map.recorder.log
+    keyframes = tracker.keyframes
     tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
     times = np.array([r.timestamp for r in tracked], np.float64)
-    errors, edges = row_errors(log, keyframes), tracker.map.graph.edges
+    errors = row_errors(log, keyframes)
+    edges = tracker.map.graph.edges
     around = keyframe_uncertainty(tracker, errors).at(times)
-    none, unknown = PoseDeviation(0.0, 0.0), PoseDeviation(np.inf, np.inf)
+    none = PoseDeviation(0.0, 0.0)
+    unknown = PoseDeviation(np.inf, np.inf)
     known = dict.fromkeys((k.frame_index for k in keyframes), none)
     known |= own_deviations(log, keyframes)
     twists = None if errors is None else row_twists(errors, keyframes, edges, log, True)
@@ -62,7 +65,8 @@ def own_deviations(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, PoseDe
     frame's median residual over the expected one, and times ``CAUTION``. Frames without matches are
     left out. Source: the variance factor a posteriori of least squares, by a median for robustness.
     """
-    grid, found = keyframes.grid, dict[int, PoseDeviation]()
+    grid = keyframes.grid
+    found = dict[int, PoseDeviation]()
     cells = sparse_cells(grid)
     solver = motion_solver(grid, cells)
     for part, problem in observed(tracked_on(frames, keyframes), keyframes):

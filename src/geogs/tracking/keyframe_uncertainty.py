@@ -13,9 +13,14 @@ from torch import Tensor
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import CellProjection, relative_motion
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.gauge import deviations_after_alignment
 from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence, lens_prior
-from geogs.bundle.uncertainty.marginals import Considered, Marginals, common_errors, marginals
+from geogs.bundle.uncertainty.marginals import (
+    Considered,
+    Marginals,
+    common_errors,
+    deviations_after_alignment,
+    marginals,
+)
 from geogs.bundle.uncertainty.varying_intrinsics import (
     FIRST,
     VaryingEvidence,
@@ -57,8 +62,8 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
 
     Pose deviations are those of the errors left after alignment with the truth by a similarity, as
     frame and unit of the map are arbitrary
-    (:func:`~geogs.bundle.uncertainty.gauge.deviations_after_alignment`). In the world of a saved
-    map: of its new keyframes, relative to it.
+    (:func:`~geogs.bundle.uncertainty.marginals.deviations_after_alignment`). In the world of a
+    saved map: of its new keyframes, relative to it.
 
     In a video of more than ``TOGETHER`` keyframes each part begins where the one before it ended,
     and deviations are relative to the first keyframe: errors add up along the path regardless of
@@ -68,15 +73,19 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth, residual = (np.full(len(ids), np.inf) for _ in range(4))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
-    propagated, focal, change, lenses = np.zeros(2), 0.0, 0.0, 0.0
-    lens = tracker.keyframes.table.lens
+    propagated = np.zeros(2)
+    focal = 0.0
+    change = 0.0
+    lenses = 0.0
+    table = tracker.keyframes.table
     for part in _parts(ids):
         found = _marginals(tracker, ids[part], rows)
         if found is None:
             continue
         depth[part] = found.depth_deviation.numpy()
         residual[part] = found.normalised_residual.numpy()
-        focal, change = max(focal, found.focal_variance), max(change, found.focal_change)
+        focal = max(focal, found.focal_variance)
+        change = max(change, found.focal_change)
         lenses = max(lenses, found.lens_change)
         if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
             T_cw = tracker.keyframes.poses(ids)
@@ -86,17 +95,18 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
         squares = squares + propagated
         position[part], rotation[part] = np.sqrt(squares).T
         propagated = squares[-1] if not tracker.segment.fixed else propagated
-    # An estimated lens keeps the deviation of its estimate: matches on images straightened by it
-    # agree with it.
-    open_ = lens.deviation_focal if lens is not None else 0.0
-    focal = max(open_, math.sqrt(focal))
-    fixed, edges = set(tracker.segment.fixed), tracker.map.graph.edges
+    focal = math.sqrt(focal)
+    if table.lens is not None:
+        # An estimated lens keeps the deviation of its estimate: matches on images straightened by
+        # it agree with it.
+        focal = max(table.lens.deviation_focal, focal)
+    fixed = set(tracker.segment.fixed)
+    edges = tracker.map.graph.edges
     held = largest_part(tracker.keyframes, edges, MIN_SHARED, fixed).intersection(ids)
     joined = max(len(held), 1) / max(len(ids), 1)
-    return Uncertainty(
-        times, position, rotation, depth, focal, misfit(residual), change, lenses, joined,
-        bool(tracker.keyframes.table.frame_lenses),
-    )  # fmt: skip
+    off = misfit(residual)
+    varies = bool(table.frame_lenses)
+    return Uncertainty(times, position, rotation, depth, focal, off, change, lenses, joined, varies)
 
 
 def misfit(residuals: Float[np.ndarray, "n"]) -> float:
@@ -120,9 +130,8 @@ def said_of_lens(
     Also on the readout, if ``rows`` are given.
     """
     found = None
-    for part in _parts(ids):
-        matches = _Matches.among(tracker, ids[part])
-        said = None if matches is None else matches.lens(rows)
+    for matches in _matches_in_parts(tracker, ids):
+        said = matches.lens(rows)
         if said is not None:
             found = said if found is None else found.joined(said)
     return found
@@ -137,10 +146,9 @@ def said_of_frame_lenses(
     the next.
     """
     found = []
-    for part in _parts(ids):
-        matches = _Matches.among(tracker, ids[part])
-        said = None if matches is None else matches.frame_lenses()
-        if matches is not None and said is not None:
+    for matches in _matches_in_parts(tracker, ids):
+        said = matches.frame_lenses()
+        if said is not None:
             found.append((matches.frames, said))
     return found
 
@@ -149,6 +157,14 @@ def _parts(ids: list[int]) -> Iterator[slice]:
     """Yield spans of ids that are solved jointly; the last of one is the first of the next."""
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         yield slice(first, first + TOGETHER + 1)
+
+
+def _matches_in_parts(tracker: Tracker, ids: list[int]) -> Iterator["_Matches"]:
+    """Yield the matches of each span of ids that has any."""
+    for part in _parts(ids):
+        matches = _Matches.among(tracker, ids[part])
+        if matches is not None:
+            yield matches
 
 
 @dataclass(frozen=True)
@@ -206,18 +222,24 @@ class _Matches:
         """Return the errors of per-frame intrinsics, given the present estimates ``own``."""
         each = [own.get(k, FrameLens()) for k in self.frames]
         return considered_lenses(
-            said, self.grid, self.problem, OPTIONS, CELLS,
+            said,
+            self.grid,
+            self.problem,
+            OPTIONS,
+            CELLS,
             torch.tensor([o.sizes for o in each], dtype=torch.float64),
-            self.times, self.shared,
-        )  # fmt: skip
+            self.times,
+            self.shared,
+        )
 
     def _slope(
         self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
     ) -> Float[Tensor, "e p 2"]:
         """Return derivatives of matches, at the projected cells, by the factor on the readout."""
-        i, j = ([self.keyframes[self.frames[n]].frame_index for n in x] for x in (
-            part.source.tolist(), part.target.tolist()
-        ))  # fmt: skip
+        i, j = (
+            [self.keyframes[self.frames[n]].frame_index for n in x]
+            for x in (part.source.tolist(), part.target.tolist())
+        )
         T_ji = relative_motion(part.T_cw, part.source, part.target)
         depth = part.inverse_depth[part.source]
         return rows.of_matches(i, j, T_ji, rays, depth, at.pixels).slope
@@ -254,7 +276,8 @@ def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marg
             found = found.beside(matches.considered_lenses(own_lenses, table.frame_lenses))
     free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[free[:, None], free]
-    depth, residual = found.relative_depth[own], found.normalised_residual[own]
+    depth = found.relative_depth[own]
+    residual = found.normalised_residual[own]
     change = 0.0 if said is None else said.focal_change
     lenses = 0.0 if own_lenses is None else matches.lens_change(own_lenses)
     return Marginals(covariance, depth, residual, found.focal_variance, change, lenses)

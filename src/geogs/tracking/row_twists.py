@@ -139,8 +139,11 @@ def _of_twists(
     A: Float64[Tensor, "n 12 13"],
 ) -> tuple[Float64[Tensor, "n 6 6"], Float64[Tensor, "n 6 6"], Float64[Tensor, "n 6 1"]]:
     """Eliminate poses: return their dependence on the twists, and the equations of the twists."""
-    H, v = A[..., :12], A[..., 12:]
-    of_pose, both, of_twist = H[:, :6, :6], H[:, 6:, :6], H[:, 6:, 6:]
+    H = A[..., :12]
+    v = A[..., 12:]
+    of_pose = H[:, :6, :6]
+    both = H[:, 6:, :6]
+    of_twist = H[:, 6:, 6:]
     largest = of_pose.diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-9)
     damped = of_pose + 1e-9 * largest[:, None, None] * torch.eye(6, dtype=H.dtype)
     follow, step = torch.linalg.solve(damped, torch.cat([both.mT, v[:, :6]], 2)).split([6, 1], 2)
@@ -167,10 +170,14 @@ def _of_keyframes(keyframes: KeyframeSet, edges: Mapping[Pair, Edge]) -> Iterato
         pixels, weight = edge_matches(grid, [edges[pair] for pair in part])
         yield _Matches(
             [keyframes[i].frame_index for i in ids],
-            [keyframes[j].frame_index for _, j in part], keyframes.relative_poses(part), grid.rays,
-            keyframes.inverse_depths(ids), pixels, keyframes.informations(ids),
+            [keyframes[j].frame_index for _, j in part],
+            keyframes.relative_poses(part),
+            grid.rays,
+            keyframes.inverse_depths(ids),
+            pixels,
+            keyframes.informations(ids),
             static_weight(keyframes, part, pixels, weight),
-        )  # fmt: skip
+        )
 
 
 def _of_frames(
@@ -182,9 +189,12 @@ def _of_frames(
         target = [record.index for record, _ in part]
         found = torch.stack([o.shifted if are_corrected else o.of_one_lens for _, o in part])
         yield _Matches(
-            [keyframes[k].frame_index for k in ids], target,
-            errors.poses(target) @ se3_inverse(keyframes.poses(ids)), grid.rays[cells],
-            keyframes.inverse_depths(ids)[:, cells], unpacked_positions(grid, found),
+            [keyframes[k].frame_index for k in ids],
+            target,
+            errors.poses(target) @ se3_inverse(keyframes.poses(ids)),
+            grid.rays[cells],
+            keyframes.inverse_depths(ids)[:, cells],
+            unpacked_positions(grid, found),
             keyframes.informations(ids)[:, cells],
             torch.stack([o.half_weight for _, o in part]).float(),
-        )  # fmt: skip
+        )

@@ -169,7 +169,8 @@ class Segments:
             self._begin_segment()
             if not frame.follows_cut:
                 new = self.current.segment.status
-                new.orientation, status.orientation = status.orientation, OrientationTrack()
+                new.orientation = status.orientation
+                status.orientation = OrientationTrack()
         return self._reported(self.current.track(frame))
 
     def complete(self) -> TrackResult:

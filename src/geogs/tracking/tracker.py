@@ -19,14 +19,13 @@ from geogs.tracking.follower import Follower
 from geogs.tracking.frames.pose_filling import solve_trajectory
 from geogs.tracking.keyframes.keyframe_choice import LATEST, KeyframeChoice, is_near_end
 from geogs.tracking.keyframes.segment_map import SegmentMap
-from geogs.tracking.local_mapping import LocalMapping
+from geogs.tracking.local_mapping import LocalMapping, track_from_start
 from geogs.tracking.locate.frame_locator import FrameMotion, Recognition
 from geogs.tracking.locate.localiser import SegmentLocaliser
 from geogs.tracking.locate.orientation_follower import OrientationFollower
 from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
 from geogs.tracking.matching.flow_chain import MIN_TEXTURE
 from geogs.tracking.start.start_up import StartUp
-from geogs.tracking.track_from_start import track_from_start
 from geogs.types import Frame, Trajectory
 from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -73,7 +72,9 @@ class Tracker:
     ) -> None:
         """``segment`` is the state so far, changed in place. With ``defers`` new keyframes get only
         a pose until :meth:`complete` is called."""
-        self.segment, self.keyframes, self.config = segment, segment.keyframes, config.tracking
+        self.segment = segment
+        self.keyframes = segment.keyframes
+        self.config = config.tracking
         self.map = SegmentMap(segment, operator, config, prior)
         grid = self.keyframes.grid
         self._choice = KeyframeChoice(self.config, grid, segment.sharpness)
@@ -102,7 +103,8 @@ class Tracker:
     def deviation(self) -> DeviationOf | None:
         """Return a function for the deviations of the last pose relative to the keyframes around;
         None if it has no pose, or was located with others at the start."""
-        motion, keyframes = self._motion, self.keyframes
+        motion = self._motion
+        keyframes = self.keyframes
         if motion is None or motion.keyframe not in keyframes:
             return None
         return deviation_of(keyframes.grid, keyframes[motion.keyframe], motion)
@@ -129,7 +131,8 @@ class Tracker:
         Raises InputError if its size is not the camera's.
         """
         self._check_size(frame)
-        status, self._motion = self.segment.status, None
+        status = self.segment.status
+        self._motion = None
         self.map.recorder.note_rows(frame)
         encoded = self.map.operator.encode(frame.image)
         self._choice.see(frame.image)
@@ -184,8 +187,10 @@ class Tracker:
 
         The camera's state is that of the later of the two. The other must not be used again.
         """
-        own, theirs = self.segment, other.segment
-        ids, guests = own.keyframes.ids, theirs.keyframes.ids
+        own = self.segment
+        theirs = other.segment
+        ids = own.keyframes.ids
+        guests = theirs.keyframes.ids
         breaks = {*own.breaks, *theirs.breaks, *[k for k in ids if k > guests[-1]][:1]}
         if guests[0] > ids[0]:
             breaks.add(guests[0])
@@ -199,7 +204,8 @@ class Tracker:
 
     def follower(self) -> Follower:
         """Return a locator of frames for while another thread completes the keyframe."""
-        new, last = self._unfinished, self.segment.status.last
+        new = self._unfinished
+        last = self.segment.status.last
         assert new is not None, "no keyframe waits to be completed"
         assert last is not None
         keyframes = self.keyframes
@@ -209,25 +215,26 @@ class Tracker:
 
     def take_over(self, follower: Follower) -> None:
         """Take over the frames that were followed while the keyframe was completed."""
+        status = self.segment.status
         keyframe = self.keyframes[follower.last.keyframe]
         for found in follower.frames:
-            frame, encoded = found.frame, found.encoded
             T_rel = keyframe.at_present_scale(found.T_rel, follower.last.scale)
-            self.map.recorder.add(frame, encoded, keyframe.id, T_rel, found.motion.match)
-            self._orientation.located(self.segment.status.orientation, frame, encoded)
-            self._choice.see(frame.image)
-        self.segment.status.last = follower.last
+            self.map.recorder.add(
+                found.frame, found.encoded, keyframe.id, T_rel, found.motion.match
+            )
+            self._orientation.located(status.orientation, found.frame, found.encoded)
+            self._choice.see(found.frame.image)
+        status.last = follower.last
         self._motion = None  # it belongs to the keyframe before its completion
 
     def complete(self) -> TrackResult:
         """Complete the new keyframe: neighbours, depth, local adjustment."""
-        new, self._unfinished = self._unfinished, None
+        new = self._unfinished
+        self._unfinished = None
         assert new is not None, "no keyframe waits to be completed"
-        culls = not new.is_last
-        self.local.update(new.keyframe, new.motion.keyframe, new.rotations, culls)
+        self.local.update(new.keyframe, new.motion.keyframe, new.rotations, not new.is_last)
         fresh = self.map.finalise(self.local.lasting)
-        state, active = self.segment.status.state, self.local.active
-        return TrackResult(state, fresh, active)
+        return TrackResult(self.segment.status.state, fresh, self.local.active)
 
     # --- steps of a frame ----------------------------------------------------------------------
 
@@ -242,7 +249,9 @@ class Tracker:
 
     def _initialise(self, frame: Frame, encoded: Any) -> TrackResult:
         """Process a frame while there is no map; it may start the map."""
-        status, keyframes, rotations = self.segment.status, self.keyframes, []
+        status = self.segment.status
+        keyframes = self.keyframes
+        rotations = []
         if not len(keyframes):
             followed = self._orientation.follow(status.orientation, frame, encoded)
             rotations = [] if followed is None else [followed.rotation]
@@ -257,9 +266,9 @@ class Tracker:
     def _begin(self) -> None:
         """Initialise tracking right after the map was started."""
         self.map.odometry.update_scale()
-        keyframes = self.keyframes
         track_from_start(self.local, self._localiser.locator)
-        status, last = self.segment.status, keyframes[keyframes.ids[-1]]
+        status = self.segment.status
+        last = self.keyframes[self.keyframes.ids[-1]]
         status.last = LastFrame.at(last)
         after = [r for r in self.map.recorder.unplaced() if r.index > last.frame_index]
         if after:
@@ -284,11 +293,15 @@ class Tracker:
         rotations: Sequence[RelativeRotation] = (),
     ) -> TrackResult:
         """Log a located frame, or make it a keyframe if needed."""
-        status, self._motion = self.segment.status, motion
-        anchor, last = self.keyframes[motion.keyframe], self._located(frame, motion)
+        status = self.segment.status
+        self._motion = motion
+        anchor = self.keyframes[motion.keyframe]
+        last = self._located(frame, motion)
         if status.state is TrackState.LOST:
             self.segment.breaks.append(self.keyframes.table.next_id)
-        status.state, status.misses, status.frames_lost = TrackState.TRACKING, 0, 0
+        status.state = TrackState.TRACKING
+        status.misses = 0
+        status.frames_lost = 0
         status.last = last
         self._orientation.located(status.orientation, frame, encoded)
         # Where few frames have sensor depth, each of them is worth a keyframe.
@@ -297,7 +310,7 @@ class Tracker:
         )
         latest = (self.keyframes[k].frame_index for k in self.keyframes.ids[-LATEST:])
         ends = is_near_end(frame.left, latest)
-        if not (is_first_measured or self._choice.calls_for(motion.seen, ends)):
+        if not (is_first_measured or self._choice.calls_for(motion, ends)):
             self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)
             return TrackResult(status.state, active=self.local.active)
         keyframe = self.local.insert(frame, encoded, motion)
@@ -307,8 +320,12 @@ class Tracker:
 
     def _located(self, frame: Frame, motion: FrameMotion) -> LastFrame:
         """Return the pose of the frame, and the motion since the frame before."""
-        status, anchor, T_before = self.segment.status, self.keyframes[motion.keyframe], self.T_cw
-        velocity, interval, before = None, 0.0, status.last
+        status = self.segment.status
+        anchor = self.keyframes[motion.keyframe]
+        T_before = self.T_cw
+        velocity = None
+        interval = 0.0
+        before = status.last
         is_tracking = status.state is TrackState.TRACKING
         if before is not None and T_before is not None and is_tracking:
             velocity = motion.T_cw @ se3_inverse(T_before)
@@ -326,7 +343,8 @@ def lone_tracker(
     defers: bool = False,
 ) -> Tracker:
     """Return a tracker of a video with one segment, without loops and without a map of disks."""
-    grid, config = SampleGrid(camera, device), config or Config()
+    grid = SampleGrid(camera, device)
+    config = config or Config()
     operator = operator or build_operator(config.tracking, grid)
     segment = VideoSegment(keyframes=KeyframeTable.on(grid, operator.encode).new_set())
     return Tracker(segment, operator, config, prior, defers)

@@ -21,9 +21,6 @@ import numpy as np
 
 from geogs.errors import InputError, OutputError
 
-_PIECE = 1 << 24
-"""Bytes copied at once."""
-
 
 class Archive:
     """A file of arrays of any shape and type, for as long as the process lasts.
@@ -79,12 +76,14 @@ class Archive:
         Raises OutputError if the file has been cut off.
         """
         array = np.empty(archived.shape, archived.dtype)
-        rest, offset = _bytes(array), archived.offset
+        rest = _bytes(array)
+        offset = archived.offset
         while rest:
             done = os.preadv(self._file.fileno(), [rest], offset)
             if done == 0:
                 raise OutputError(f"The archive in {self.folder} has been cut off.")
-            rest, offset = rest[done:], offset + done
+            rest = rest[done:]
+            offset = offset + done
         return array
 
     # --- checkpoints -----------------------------------------------------------------------
@@ -102,7 +101,8 @@ class Archive:
             raise self._unwritable(error, folder.path) from error
         with self._lock:
             self._collect()
-        self._releasing, self._withheld = self._releasing + self._withheld, []
+        self._releasing = self._releasing + self._withheld
+        self._withheld = []
         unused = [(o, size) for size, offsets in self._free.items() for o in offsets]
         return SettledArchive(self._end, [*unused, *self._releasing])
 
@@ -127,7 +127,9 @@ class Archive:
                 raise InputError(f"{name} is cut off")
             os.truncate(file.fileno(), settled.end)
             os.dup2(file.fileno(), archive._file.fileno())
-        archive.name, archive._is_settled, archive._end = name, True, settled.end
+        archive.name = name
+        archive._is_settled = True
+        archive._end = settled.end
         for offset, size in settled.free:
             archive._free.setdefault(size, []).append(offset)
         return archive
@@ -151,13 +153,14 @@ class Archive:
         with folder.create(self.name) as named:
             done = 0
             while done < self._end:
-                piece = os.pread(self._file.fileno(), min(_PIECE, self._end - done), done)
+                piece = os.pread(self._file.fileno(), min(1 << 24, self._end - done), done)
                 if not piece:  # something could not be written
                     break
                 done += os.pwrite(named.fileno(), piece, done)
             os.truncate(named.fileno(), self._end)
             os.dup2(named.fileno(), self._file.fileno())  # other threads notice nothing
-        self.folder, self._is_settled = folder.path, True
+        self.folder = folder.path
+        self._is_settled = True
 
     def _archived(
         self, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
@@ -175,7 +178,8 @@ class Archive:
         try:
             while rest:
                 done = os.pwrite(self._file.fileno(), rest, offset)
-                rest, offset = rest[done:], offset + done
+                rest = rest[done:]
+                offset = offset + done
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -192,9 +196,10 @@ class Archive:
         """Return the error for this file, or for the settled file in a folder."""
         settled = settled or (self.folder if self._is_settled else None)
         remedy = (
-            "name a folder on a larger disk in TMPDIR" if settled is None
+            "name a folder on a larger disk in TMPDIR"
+            if settled is None
             else "give a folder on a larger disk for the results"
-        )  # fmt: skip
+        )
         return OutputError(
             f"The keyframes of a long video cannot be kept in {settled or self.folder} "
             f"({error.strerror or error}); free some space, or {remedy}."

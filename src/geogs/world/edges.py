@@ -17,9 +17,6 @@ from geogs.limits import POSITIVE, KeyframeId, Pose
 from geogs.world.arrays import NOT_STORED
 from geogs.world.grid import SampleGrid
 
-MAX_WEIGHT = 6e4
-"""Largest weight that half precision holds, 1 / pixel^2."""
-
 Pair = tuple[KeyframeId, KeyframeId]
 """Two keyframe ids: source and target of a directed edge, or the earlier first for both."""
 
@@ -94,7 +91,7 @@ def pack_matches(
     """Pack positions in whole steps from the image's centre, zero where unmatched, and weights."""
     steps = (pixels - grid.centre) / position_step(grid.camera)
     position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
-    return position, weight.clamp(max=MAX_WEIGHT).half()
+    return position, weight.clamp(max=6e4).half()  # half precision holds hardly more
 
 
 def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:

@@ -43,7 +43,8 @@ class SampleGrid:
                 "tracking needs at least 32 x 32."
             )
         yy, xx = torch.meshgrid(y, x, indexing="ij")
-        cam, pixels = self.camera, torch.stack([xx, yy], -1)
+        cam = self.camera
+        pixels = torch.stack([xx, yy], -1)
         rays = torch.cat([cam.plane(pixels), torch.ones_like(pixels[..., :1])], -1)
         object.__setattr__(self, "width", len(x))
         object.__setattr__(self, "height", len(y))
@@ -81,7 +82,8 @@ class SampleGrid:
         self, values: Float[Tensor, "p c"], points: Float[Tensor, "n 2"]
     ) -> Float[Tensor, "n c"]:
         """Interpolate a field on the grid bilinearly at any pixels; replicated at the border."""
-        cells, sides = (points - OFFSET) / STRIDE, (self.width - 1, self.height - 1)
+        cells = (points - OFFSET) / STRIDE
+        sides = (self.width - 1, self.height - 1)
         normalised = torch.stack([cells[:, k] * (2 / sides[k]) - 1 for k in (0, 1)], -1)
         image = values.mT.reshape(1, -1, self.height, self.width)
         out = torch.nn.functional.grid_sample(

@@ -12,17 +12,16 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from torch import Tensor
 
-from geogs.camera.straight_view import StraightView
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import scaled, se3_inverse, sim3_scale
 from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
 from geogs.types import FoundLens, FrameLens, MeasuredPose, PoseCorrection
-from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
+from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable, PoseTable
 from geogs.world.cell_depths import KeyframePrior, MeasuredCells
 from geogs.world.grid import SampleGrid
-from geogs.world.pose_table import PoseTable
 from geogs.world.tables import check_arrays, check_tables
 
 Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
@@ -126,7 +125,8 @@ class Keyframe:
     def copied_to(self, table: "KeyframeTable") -> "Keyframe":
         """Copy it for another table, without the pose."""
         twin = copy.copy(self)
-        twin.prior, twin.measured = copy.copy(self.prior), copy.copy(self.measured)
+        twin.prior = copy.copy(self.prior)
+        twin.measured = copy.copy(self.measured)
         twin.table = table
         return twin
 
@@ -175,7 +175,8 @@ class Keyframe:
     def depth_field(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
         """Inverse depth and its ``confident_information`` as images of the cells of the straight
         image, on the CPU."""
-        grid, shown = self.grid, self._shown
+        grid = self.grid
+        shown = self._shown
         fields = torch.stack([self.inverse_depth, self.confident_information])
         if shown is not None:
             fields = grid.sample_field(fields.mT, shown).mT
@@ -246,7 +247,10 @@ class KeyframeTable:
     ) -> "KeyframeTable":
         """Set what is not stored: the grid of depths, the image encoder, how many large arrays of
         a name stay in memory, and the prior deviation of the focal length. Return the table."""
-        self.grid, self.camera, self.encode, self.set_of = grid, grid.camera, encode, {}
+        self.grid = grid
+        self.camera = grid.camera
+        self.encode = encode
+        self.set_of = {}
         if self.lens is not None:
             self.see_by(StraightView(self.camera, self.lens).seen_by)
         self.focal_deviation = focal_deviation
@@ -263,14 +267,15 @@ class KeyframeTable:
         """Return how the image of a keyframe was straightened; None where it was not."""
         if self.lens is None:
             return None
-        view, own = _view(self.camera, self.lens), self.frame_lenses.get(id)
-        return view if own is None else view.of_frame(own)
+        return FrameViews(_view(self.camera, self.lens), self.frame_lenses).of(id)
 
     def mirror(self) -> "KeyframeTable":
         """Return an empty table that shares the large arrays of this one."""
         twin = KeyframeTable(arrays=self.arrays, lens=self.lens, frame_lenses=self.frame_lenses)
-        twin.grid, twin.camera = self.grid, self.camera
-        twin.encode, twin.set_of = self.encode, {}
+        twin.grid = self.grid
+        twin.camera = self.camera
+        twin.encode = self.encode
+        twin.set_of = {}
         return twin
 
     def __getitem__(self, id: int) -> Keyframe:
@@ -349,10 +354,12 @@ class KeyframeSet:
     ) -> Keyframe:
         """Add a keyframe with unit inverse depth and no information: the latest, or with ``id`` one
         that was removed."""
-        table, grid = self.table, self.table.grid
+        table = self.table
+        grid = self.table.grid
         table.forget_removed()
         if id is None:
-            id, table.next_id = table.next_id, table.next_id + 1
+            id = table.next_id
+            table.next_id = table.next_id + 1
         ones = torch.ones(grid.size, device=grid.device)
         keyframe = Keyframe(id, frame_index, timestamp, ones, 0 * ones)
         table.arrays.put("image", id, image, recent=True)
@@ -402,6 +409,12 @@ class KeyframeSet:
         """Return the information on the grid, pixels^2 per inverse depth^2."""
         return torch.stack([self[i].information for i in ids])
 
+    def moving(self, ids: Sequence[int]) -> Bool[Tensor, "n p"]:
+        """Return which cells show something dynamic."""
+        none = torch.zeros(self.grid.size, dtype=torch.bool, device=self.grid.device)
+        found = (self[i].moving for i in ids)
+        return torch.stack([none if cells is None else cells for cells in found])
+
     def median_depths(self, ids: Sequence[int]) -> Float[Tensor, "n"]:
         """Return the median depth of each keyframe's cells, float64, on the CPU."""
         return 1 / self.inverse_depths(ids).median(1).values.cpu().double()
@@ -425,7 +438,8 @@ class KeyframeSet:
 
     def take_corrections(self) -> list[PoseCorrection]:
         """Return the corrections made since the last call, earliest first."""
-        taken, self._corrections = self._corrections, []
+        taken = self._corrections
+        self._corrections = []
         return taken
 
     def moved(self, S: Float[Tensor, "4 4"]) -> PoseCorrection:
@@ -450,7 +464,8 @@ def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:
 
     Raises InputError if a keyframe is missing, of another camera, or out of order.
     """
-    sizes, seen = table.grid.sizes, set[int]()
+    sizes = table.grid.sizes
+    seen = set[int]()
     check_tables(KeyframeTable, table, sizes, {})
     check_arrays(table.arrays, KEYFRAME_ARRAYS, sizes, range(table.next_id))
     for members in (keyframes.members for keyframes in sets):

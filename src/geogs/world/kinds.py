@@ -106,7 +106,8 @@ def described(kind: Any) -> str:
         return f"{kind.array_type.__name__}[{'|'.join(kind.dtypes)};{kind.dim_str}]"
     if isinstance(kind, type) and issubclass(kind, Enum):
         return f"{kind.__name__}({','.join(kind.__members__)})"
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if origin is Literal:
         return f"Literal{list(inner)}"
     if origin is not None:
@@ -117,7 +118,8 @@ def described(kind: Any) -> str:
 
 def parts(kind: Any, record: Any, place: str = "") -> Iterator[Part]:
     """Yield every number, text and array of a record, with its path."""
-    marks, kind = marks_of(kind), plain(kind)
+    marks = marks_of(kind)
+    kind = plain(kind)
     origin = get_origin(kind)
     if record is None:
         return

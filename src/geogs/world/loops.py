@@ -209,7 +209,8 @@ def check_loops(table: LoopTable, keyframes: KeyframeTable, segments: Container[
     Raises InputError if it is incomplete, or names keyframes or segments that are missing.
     """
     check_tables(LoopTable, table, keyframes.grid.sizes, {"keyframes": keyframes})
-    vocabulary, words = table.vocabulary, len(table.vocabulary.words)
+    vocabulary = table.vocabulary
+    words = len(table.vocabulary.words)
     counts = vocabulary.counts
     if len(counts) != len(vocabulary.keyframes) or any(
         ((c[:, 0] < 0) | (c[:, 0] >= words) | (c[:, 1] < 1)).any() for c in counts

@@ -100,18 +100,22 @@ class RandomState:
     def seeded(seed: int) -> "RandomState":
         """Return the initial state of a seed."""
         drawn = np.random.default_rng(seed).bit_generator.state
-        inner, half = drawn["state"], (drawn["has_uint32"], drawn["uinteger"])
+        inner = drawn["state"]
+        half = (drawn["has_uint32"], drawn["uinteger"])
         words = torch.Generator().manual_seed(seed).get_state()
         return RandomState(inner["state"], inner["inc"], *half, words)
 
     def __post_init__(self) -> None:
         """Raises InputError if the numbers are no valid state."""
-        self.of_numpy, self.of_torch = np.random.default_rng(0), torch.Generator()
+        self.of_numpy = np.random.default_rng(0)
+        self.of_torch = torch.Generator()
         try:
             self.of_numpy.bit_generator.state = {
-                "bit_generator": "PCG64", "state": {"state": self.state, "inc": self.increment},
-                "has_uint32": self.has_half, "uinteger": self.half,
-            }  # fmt: skip
+                "bit_generator": "PCG64",
+                "state": {"state": self.state, "inc": self.increment},
+                "has_uint32": self.has_half,
+                "uinteger": self.half,
+            }
             self.of_torch.set_state(self.words)
         except (ValueError, TypeError, OverflowError, RuntimeError) as error:
             raise InputError("the random numbers are in no state that there is") from error
@@ -119,8 +123,10 @@ class RandomState:
     def settle(self) -> None:
         """Store the present state of the generators."""
         now = self.of_numpy.bit_generator.state
-        self.state, self.increment = now["state"]["state"], now["state"]["inc"]
-        self.has_half, self.half = now["has_uint32"], now["uinteger"]
+        self.state = now["state"]["state"]
+        self.increment = now["state"]["inc"]
+        self.has_half = now["has_uint32"]
+        self.half = now["uinteger"]
         self.words = self.of_torch.get_state()
 
 

@@ -125,9 +125,12 @@ class _Packer:
             return self._archive(value)
         if kind is Archived:
             return {
-                "archive": self._archive(value.archive), "offset": value.offset,
-                "shape": list(value.shape), "dtype": value.dtype.name, "checksum": value.checksum,
-            }  # fmt: skip
+                "archive": self._archive(value.archive),
+                "offset": value.offset,
+                "shape": list(value.shape),
+                "dtype": value.dtype.name,
+                "checksum": value.checksum,
+            }
         if isinstance(value, Enum):
             return value.name
         return str(value) if isinstance(value, Path) else value
@@ -167,7 +170,9 @@ class _Unpacker:
     def __init__(
         self, arrays: Mapping[str, Tensor], archives: Mapping[str, Archive], device: torch.device
     ) -> None:
-        self._arrays, self._archives, self._device = arrays, archives, device
+        self._arrays = arrays
+        self._archives = archives
+        self._device = device
         self._pieces: dict[tuple[Any, ...], Archived] = {}
         """One reference per piece of an archive: its space is freed with that reference."""
 
@@ -223,7 +228,8 @@ class _Unpacker:
         return self.value(kinds[number], form, name)
 
     def _record(self, kind: Any, value: Values, name: str) -> Any:
-        own, given = stored(kind), self._of(dict, value, name)
+        own = stored(kind)
+        given = self._of(dict, value, name)
         if given.keys() != own.keys():
             self._wrong(name)
         parts = {n: self.value(k, given[n], joined(name, n)) for n, k in own.items()}

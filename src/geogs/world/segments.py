@@ -118,7 +118,8 @@ class OrientationTrack:
 
     def reset(self, view: ReferenceView | None = None) -> None:
         """Begin again at a view, or without one: no motion then links the next frame."""
-        self.view, self.misses = view, 0
+        self.view = view
+        self.misses = 0
         self.flow.reset()
 
 
@@ -247,7 +248,8 @@ def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -
     sizes = keyframes.grid.sizes
     for segment in table.segments:
         check_tables(VideoSegment, segment, sizes, {"keyframes": segment.keyframes})
-        edges, indices = segment.edges, [record.index for record in segment.frames.records]
+        edges = segment.edges
+        indices = [record.index for record in segment.frames.records]
         if not all(i != j and (j, i) in edges for i, j in edges):
             raise InputError(f"an edge of segment {segment.number} has no way back")
         if not _ascends(indices) or indices[-1:] >= [frames]:

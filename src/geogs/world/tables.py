@@ -26,7 +26,8 @@ def check_tables(kind: Any, record: object, sizes: Sizes, tables: Tables) -> Non
             raise InputError(f"{part.place} is of another camera")
         for mark in part.marks:
             if isinstance(mark, Reference) and mark.table in tables:
-                rows, named = tables[mark.table], part.value
+                rows = tables[mark.table]
+                named = part.value
                 several = named.tolist() if isinstance(named, Tensor | np.ndarray) else [named]
                 if not all(row in rows for row in set(several)):
                     raise InputError(f"{part.place} names what is missing in the {mark.table}")
@@ -47,7 +48,8 @@ def check_arrays(
 
 
 def _is_of(kind: Any, piece: Archived, sizes: Sizes) -> bool:
-    bare, marks = plain(kind), marks_of(kind)
+    bare = plain(kind)
+    marks = marks_of(kind)
     # Types and shapes need no values: check a broadcast array that takes next to no memory.
     shape = np.broadcast_to(np.zeros((), piece.dtype), piece.shape)
     if not isinstance(shape, bare) or _has_other(sizes, bare, shape):

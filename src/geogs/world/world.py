@@ -49,7 +49,8 @@ def check_world(world: World) -> None:
 
     Raises InputError if something is missing or of another camera.
     """
-    keyframes, segments = world.keyframes, world.segments.segments
+    keyframes = world.keyframes
+    segments = world.segments.segments
     for segment in segments:
         segment.keyframes.attached(keyframes)
     check_keyframes(keyframes, [segment.keyframes for segment in segments])

@@ -1,26 +1,89 @@
-"""Training of the baseline within a time budget."""
+"""Training of the baseline within a time budget, by the losses of 2DGS: L1, SSIM and normals."""
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from geogs.errors import InputError
 from geogs_bench.appearance.appearance_config import AppearanceConfig
-from geogs_bench.appearance.appearance_disks import AppearanceDisks, disks_at_points
-from geogs_bench.appearance.appearance_losses import normal_loss, photometric_loss
-from geogs_bench.appearance.densify import GradientStatistics, refine
-from geogs_bench.appearance.disk_optimizer import DiskOptimizer
+from geogs_bench.appearance.appearance_disks import (
+    AppearanceDisks,
+    DiskOptimizer,
+    GradientStatistics,
+    disks_at_points,
+    refine,
+)
 from geogs_bench.appearance.rasteriser import Rasteriser, Rendering
-from geogs_bench.appearance.training_schedule import RefinementClock, Schedule
 from geogs_bench.appearance.training_views import DeviceView, TrainingView, scene_scale
 
 FEWEST_POINTS = 10
+_WINDOW = 11
+"""Side of the windows of SSIM, pixels."""
+_C1 = 0.01**2
+_C2 = 0.03**2
 OnTime = Callable[[float, AppearanceDisks], None]
 """Called with the training seconds so far and the disks; the clock is paused meanwhile."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The public schedule stretched over ``budget`` seconds."""
+
+    config: AppearanceConfig
+    budget: float
+    """Seconds."""
+
+    def step(self, elapsed: float) -> float:
+        """Step of the public schedule that corresponds to ``elapsed`` seconds."""
+        return self.config.steps * elapsed / self.budget
+
+    def sh_degree(self, step: float) -> int:
+        """Highest degree of the spherical harmonics in use."""
+        return min(int(step // self.config.sh_interval), self.config.sh_degree)
+
+    def means_rate(self, step: float, scene_scale: float) -> float:
+        """Learning rate of positions, units of the poses."""
+        part = min(step / self.config.steps, 1.0)
+        return self.config.means_rate * scene_scale * self.config.means_decay**part
+
+    def uses_normals(self, step: float) -> bool:
+        """Whether the consistency of normals counts."""
+        return self.config.normal_weight > 0 and step > self.config.normal_start
+
+
+class RefinementClock:
+    """Decides when disks are added and removed."""
+
+    def __init__(self, config: AppearanceConfig) -> None:
+        self._config = config
+        self._step = float(config.refine_start)
+        self._iteration = 0
+
+    def gathers(self, step: float) -> bool:
+        """Whether image gradients are still used."""
+        return step < self._config.refine_stop
+
+    def is_due(self, step: float, iteration: int) -> bool:
+        """Whether to refine now; if so, the next interval begins now."""
+        config = self._config
+        due = (
+            self.gathers(step)
+            and step - self._step >= config.refine_every
+            and iteration - self._iteration >= config.refine_iterations
+        )
+        if due:
+            self._step = step
+            self._iteration = iteration
+        return due
 
 
 @dataclass(frozen=True)
@@ -92,7 +155,8 @@ class AppearanceTrainer:
         schedule = Schedule(self.config, budget)
         self._warm_up(schedule)
         waiting = sorted(at_seconds)
-        start, paused = time.perf_counter(), 0.0
+        start = time.perf_counter()
+        paused = 0.0
         while (elapsed := time.perf_counter() - start - paused) < budget:
             if waiting and on_time and elapsed >= waiting[0]:
                 self._synchronise()
@@ -125,8 +189,10 @@ class AppearanceTrainer:
         view = self._views[self._next()]
         rendering = self._backward(view, schedule, step)
         self.iterations += 1
-        if self._clock.gathers(step):
-            self._gather(rendering, view)
+        gradient = rendering.screen.grad
+        if gradient is not None and self._clock.gathers(step):
+            shape = (view.camera.width, view.camera.height)
+            self._gradients.add(gradient.reshape(-1, 2), rendering.visible, *shape)
         self._optimizer.step(schedule.means_rate(step, self.scene_scale))
         if self._clock.is_due(step, self.iterations):
             self._refine(step)
@@ -146,12 +212,6 @@ class AppearanceTrainer:
         loss.backward()
         return rendering
 
-    def _gather(self, rendering: Rendering, view: DeviceView) -> None:
-        gradient = rendering.screen.grad
-        if gradient is not None:
-            shape = (view.camera.width, view.camera.height)
-            self._gradients.add(gradient.reshape(-1, 2), rendering.visible, *shape)
-
     def _refine(self, step: float) -> None:
         kept, added = refine(
             self.disks, self._gradients.mean(), step, self.scene_scale, self.config, self._random
@@ -161,11 +221,7 @@ class AppearanceTrainer:
         self._gradients = GradientStatistics(len(self._optimizer.disks), self._device)
 
     def _render(
-        self,
-        view: DeviceView,
-        sh_degree: int,
-        background: torch.Tensor | None,
-        normals: bool,
+        self, view: DeviceView, sh_degree: int, background: torch.Tensor | None, normals: bool
     ) -> Rendering:
         disks = self._optimizer.disks
         return self._rasteriser.render(
@@ -188,3 +244,91 @@ class AppearanceTrainer:
     def _synchronise(self) -> None:
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
+
+
+def ssim(one: Float[Tensor, "h w c"], other: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Mean structural similarity (Wang et al. 2004) of two images in [0, 1].
+
+    Gaussian windows of 11 pixels, sigma 1.5; only windows that lie wholly in the image count.
+    Differentiable, once, in the first image alone.
+    """
+    return _StructuralSimilarity.apply(one, other)
+
+
+def photometric_loss(
+    rendered: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], ssim_weight: float
+) -> Float[Tensor, ""]:
+    """(1 - w) L1 + w (1 - SSIM), Kerbl et al. 2023, Eq. 7."""
+    l1 = F.l1_loss(rendered, target)
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rendered, target))
+
+
+def normal_loss(
+    normal: Float[Tensor, "h w 3"],
+    depth_normal: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+) -> Float[Tensor, ""]:
+    """Mean of 1 - n . N alpha: blended disk normals against those of the depth map.
+
+    Huang et al. 2024, Eq. 14, with the weights' sum taken into the blended normal; the opacity
+    is constant.
+    """
+    cosine = (normal * depth_normal).sum(-1) * alpha.detach()
+    return 1 - cosine.mean()
+
+
+class _StructuralSimilarity(torch.autograd.Function):
+    """SSIM with its derivative written out: fewer operations, and all in full precision."""
+
+    @staticmethod
+    def forward(ctx: Any, one: Tensor, other: Tensor) -> Tensor:
+        a, b = (image.permute(2, 0, 1).contiguous() for image in (one, other))
+        mean_a, mean_b, square_a, square_b, product = _blur(
+            torch.cat([a, b, a * a, b * b, a * b]), 0
+        ).chunk(5)
+        mean_ab = mean_a * mean_b
+        mean_squares = mean_a.square().addcmul_(mean_b, mean_b)
+        above_luminance = 2 * mean_ab + _C1
+        above_structure = 2 * (product - mean_ab) + _C2
+        below_luminance = mean_squares + _C1
+        below_structure = square_a + square_b - mean_squares + _C2
+        below = below_luminance * below_structure
+        similarity = above_luminance * above_structure / below
+        if ctx.needs_input_grad[0]:
+            to_square = -similarity / below_structure
+            to_product = 2 * above_luminance / below
+            to_mean = 2 * mean_b * (above_structure - above_luminance) / below - 2 * mean_a * (
+                similarity / below_luminance + to_square
+            )
+            ctx.save_for_backward(a, b, torch.cat([to_mean, to_square, to_product]))
+        return similarity.mean()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        a, b, derivatives = ctx.saved_tensors
+        to_mean, to_square, to_product = _blur(derivatives, _WINDOW - 1).chunk(3)
+        total = (to_mean + 2 * a * to_square + b * to_product) * (
+            gradient * (3 / derivatives.numel())
+        )
+        return total.permute(1, 2, 0), None
+
+
+def _blur(images: Float[Tensor, "n h w"], padding: int) -> Float[Tensor, "n h2 w2"]:
+    """Gaussian mean of each window; the images are padded with ``padding`` zeros.
+
+    One convolution a channel, without cuDNN: its convolutions may round to the 10 bits of TF32,
+    and then the variance, a difference of squares, is wrong by as much as the constants of SSIM.
+    """
+    n = len(images)
+    kernel = _window(images.dtype, images.device).expand(n, 1, -1, 1)
+    with torch.backends.cudnn.flags(enabled=False):
+        rows = F.conv2d(images[None], kernel, padding=(padding, 0), groups=n)
+        return F.conv2d(rows, kernel.transpose(2, 3), padding=(0, padding), groups=n)[0]
+
+
+@functools.cache
+def _window(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "1 1 11 1"]:
+    offset = torch.arange(_WINDOW, dtype=dtype, device=device) - _WINDOW // 2
+    kernel = torch.exp(-0.5 * (offset / 1.5) ** 2)
+    return (kernel / kernel.sum()).view(1, 1, -1, 1)

@@ -6,46 +6,46 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
+
+from geogs.application.evaluate import evaluate
+from geogs.application.result_settings import EvalSettings
 from geogs.documents import read_json
 from geogs.errors import GeogsError, InputError
+from geogs.evaluation.pages.evaluation_page import Evaluation
+from geogs.evaluation.surfaces.reconstruction_errors import ReconstructionScores
 from geogs.gpu.installation import require_device
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.threads import available_cores
 from geogs_bench.bench_options import BenchOptions
-from geogs_bench.board.board_record import (
-    BoardRecord,
-    Outcome,
-    RowRecord,
-    read_board,
-    write_board,
-)
-from geogs_bench.board.board_table import markdown
+from geogs_bench.board.board_record import BoardRecord, Outcome, RowRecord, read_board, write_board
 from geogs_bench.board.commands import run_geogs
-from geogs_bench.board.comparison import Difference, compare
+from geogs_bench.board.comparison import Difference, compare, markdown
 from geogs_bench.board.footage import FootagePlace, find, frames_used, render
-from geogs_bench.board.reference import reference_seconds
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
-from geogs_bench.board.scores import with_scores
+from geogs_bench.board.with_constant import Constant
 from geogs_bench.machine import machine_name, program_version
 from geogs_bench.results.record import read_dataclass, write_json
+from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.motion_scores import is_near
 
 RECORD = "board.json"
 _OUTCOME = "outcome.json"
 _COMMIT = "commit.txt"
-_OPTIONS = ("name", "data", "output", "scenes", "device", "against", "fresh")
+_OPTIONS = ("name", "data", "output", "scenes", "device", "against", "fresh", "constants")
 _CORES_FOR_ONE = 2
 """Cores for each command that uses a GPU; a command without one gets one core."""
+_SAMPLES = 50_000
+"""Samples on each surface; the standard error of a ratio is below 0.2 points."""
 
 
-@dataclass(frozen=True)
-class _Job:
-    """A command with one seed."""
-
-    row: Row
-    seed: int
+_Job = tuple[Row, int]
+"""A command with one seed."""
 
 
 @dataclass
@@ -62,6 +62,8 @@ class Board:
     commit: str
     unit: float
     """Seconds of the fixed computation."""
+    changed: tuple[Constant, float] | None = None
+    """A constant that has another value in every command."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _begin: float = 0.0
     _jobs: int = 0
@@ -76,28 +78,26 @@ class Board:
         """
         self._begin = time.perf_counter()
         with ThreadPoolExecutor(self.side_by_side) as pool, self._rendering() as places:
-            jobs = [
-                _Job(row, seed) for row in self.chosen if row.footage in places for seed in SEEDS
-            ]
+            found = [row for row in self.chosen if row.footage in places]
+            jobs = [(row, seed) for row in found for seed in SEEDS]
             self._jobs = len(jobs)
             self._places = places
-            beside = [job for job in jobs if not job.row.runs_alone]
+            beside = [(row, seed) for row, seed in jobs if not row.runs_alone]
             try:
                 outcomes = dict(zip(beside, pool.map(self._outcome, beside), strict=True))
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-            outcomes |= {job: self._outcome(job) for job in jobs if job.row.runs_alone}
+            outcomes |= {job: self._outcome(job) for job in jobs if job not in outcomes}
         measured = tuple(
             RowRecord(
                 row.name,
                 places[row.footage].result().title,
                 f"geogs {row.command}",
                 row.runs_alone,
-                tuple(outcomes[_Job(row, seed)] for seed in SEEDS),
+                tuple(outcomes[row, seed] for seed in SEEDS),
             )
-            for row in self.chosen
-            if row.footage in places
+            for row in found
         )
         record = BoardRecord(
             self.commit,
@@ -136,30 +136,32 @@ class Board:
 
     def _outcome(self, job: _Job) -> Outcome:
         """Run a command and measure its result, or read the earlier measurement."""
-        folder = self.output / job.row.name / f"seed-{job.seed}"
+        row, seed = job
+        folder = self.output / row.name / f"seed-{seed}"
         outcome = None if self.fresh else self._measured_before(folder)
         if outcome is None:
             prepare_output_folder(folder)
-            outcome = self._measured(job, folder)
+            outcome = self._measured(row, seed, folder)
             write_json(folder / _OUTCOME, outcome)
             write_text(folder / _COMMIT, self.commit)
-        self._report(job, outcome)
+        self._report(f"{row.name}, seed {seed}", outcome)
         return outcome
 
-    def _measured(self, job: _Job, folder: Path) -> Outcome:
+    def _measured(self, row: Row, seed: int, folder: Path) -> Outcome:
         """Run a command, and compare its result with the truth."""
-        row = job.row
         place = self._places[row.footage].result()
-        start = job.seed if row.command.startswith("run") else 0
+        start = seed if row.command.startswith("run") else 0
         result = folder / "result"
         # Split before formatting, as there may be spaces in a path.
         command = [word.format(**place.words) for word in row.command.split()]
         command += place.options.split()
-        command += ["-o", str(result), "--device", self.device, "--seed", str(job.seed)]
+        command += ["-o", str(result), "--device", self.device, "--seed", str(seed)]
         command += ["--start", str(start)] if start else []
         with tempfile.TemporaryDirectory() as scratch:
-            caches = Path(scratch) if row.has_empty_cache else None
-            spent, last_line = run_geogs(command, folder / "log.txt", caches)
+            # Compiled code would keep the usual value of a constant.
+            is_compiled_anew = row.has_empty_cache or self.changed is not None
+            caches = Path(scratch) if is_compiled_anew else None
+            spent, last_line = run_geogs(command, folder / "log.txt", caches, self.changed)
         outcome = Outcome(
             cost=spent.processor_seconds / self.unit,
             seconds=spent.seconds,
@@ -182,16 +184,14 @@ class Board:
             return None
         return read_dataclass(Outcome, read_json(folder / _OUTCOME))
 
-    def _report(self, job: _Job, outcome: Outcome) -> None:
+    def _report(self, name: str, outcome: Outcome) -> None:
         with self._lock:
             self._done += 1
             passed = (time.perf_counter() - self._begin) / 60
             left = passed / self._done * (self._jobs - self._done)
             said = f"failed: {outcome.error}" if outcome.error else f"{outcome.seconds:.0f} s"
-            self.say(
-                f"[{self._done}/{self._jobs}] {job.row.name}, seed {job.seed}: {said}; "
-                f"about {left:.0f} min left"
-            )
+            counted = f"[{self._done}/{self._jobs}]"
+            self.say(f"{counted} {name}: {said}; about {left:.0f} min left")
 
 
 def board(
@@ -203,15 +203,24 @@ def board(
         InputError: an option is wrong, or the record cannot be read; found before anything is run.
         OutputError: the folder cannot be written.
     """
+    before = None if options.against is None else read_board(options.against)
+    opened = opened_board(options, say)
+    done = opened.run()
+    changes = [] if before is None else compare(before, done)
+    write_text(opened.output / "board.md", markdown(done, changes))
+    return done, changes
+
+
+def opened_board(options: BenchOptions, say: Callable[[str], None]) -> Board:
+    """The board with these options, before anything is run. Raises InputError, OutputError."""
     device = require_device(options.device)
     on_gpu = device.type == "cuda"
     _refuse_others(options)
-    before = None if options.against is None else read_board(options.against)
-    output = options.output or Path("out") / "bench-board"
+    output = options.output or Path("out") / f"bench-{options.name}"
     chosen = _chosen(options.scenes, rows(on_gpu))
     prepare_output_folder(output)
     data = options.data and options.data.expanduser()
-    done = Board(
+    return Board(
         output,
         str(device),
         data,
@@ -221,20 +230,15 @@ def board(
         say,
         program_version(),
         reference_seconds(),
-    ).run()
-    changes = [] if before is None else compare(before, done)
-    write_text(output / "board.md", markdown(done, changes))
-    return done, changes
+    )
 
 
 def _refuse_others(options: BenchOptions) -> None:
     """Raise InputError if an option is given that the board does not use."""
     usual = BenchOptions(options.name)
-    for known in fields(BenchOptions):
-        if known.name not in _OPTIONS and getattr(options, known.name) != getattr(
-            usual, known.name
-        ):
-            raise InputError(f"--{known.name.replace('_', '-')} is not for the board.")
+    for name in vars(usual):
+        if name not in _OPTIONS and getattr(options, name) != getattr(usual, name):
+            raise InputError(f"--{name.replace('_', '-')} is not for the board.")
 
 
 def _chosen(names: str, known: Sequence[Row]) -> tuple[Row, ...]:
@@ -245,3 +249,78 @@ def _chosen(names: str, known: Sequence[Row]) -> tuple[Row, ...]:
             f"the board has no row {strangers[0]}; choose of {', '.join(r.name for r in known)}."
         )
     return tuple(row for row in known if not wanted or row.name in wanted)
+
+
+def reference_seconds() -> float:
+    """Processor time of the computation in seconds, the least of a few rounds.
+
+    A mix of sorting, products of matrices, functions of arrays and filters of images, none of it
+    ours; so ratios to it hardly depend on the machine's speed or load.
+    """
+    return min(_once() for _ in range(3))
+
+
+def _once() -> float:
+    random = np.random.default_rng(0)
+    numbers = random.random(2_000_000, np.float32)
+    matrices = random.random((64, 160, 160), np.float32)
+    picture = random.integers(0, 256, (960, 1280, 3), np.uint8)
+    rows = numbers[: 640 * 480].reshape(480, 640) * 900
+    columns = numbers[-640 * 480 :].reshape(480, 640) * 900
+    start = time.thread_time()
+    for _ in range(2):
+        order = np.argsort(numbers, kind="stable")
+        np.exp(-numbers[order]).cumsum()
+        (matrices @ matrices.transpose(0, 2, 1)).sum()
+        for _ in range(4):
+            cv2.GaussianBlur(picture, (9, 9), 2.0)
+            cv2.remap(picture, rows, columns, cv2.INTER_LINEAR)
+    return time.thread_time() - start
+
+
+def with_scores(outcome: Outcome, folder: Path, truth: Path, frames: int) -> Outcome:
+    """Add the errors of the result in ``folder``, whose sequence has ``frames``, to an outcome.
+
+    Raises:
+        InputError: the result or the truth cannot be read.
+    """
+    summary = ResultFolder(folder).summary
+    found = _evaluated(folder, truth)
+    errors = found.trajectory
+    figures: dict[str, Any] = {
+        "placed": 100 * errors.pairs / frames,
+        "ate": errors.ate_rmse_cm,
+        "disks": summary.get("disks"),
+        "triangles": summary.get("mesh_faces"),
+        **_surface_figures(found, ""),
+    }
+    is_called_reliable = (summary.get("verdict") or {}).get("is_reliable")
+    if is_called_reliable is not None:
+        is_off = not is_near(errors.ate_rmse_cm, errors.truth)
+        figures["reliable"] = float(is_called_reliable)
+        figures["misjudged"] = float(is_called_reliable and is_off)
+    if found.reliability is not None:
+        figures["error_per_sigma"] = found.reliability.error_per_sigma
+    online = folder / "online"
+    if (online / "mesh.ply").is_file():  # the surface at the end of the stream
+        figures |= _surface_figures(_evaluated(online, truth), "online_")
+    return replace(outcome, **figures)
+
+
+def _evaluated(folder: Path, truth: Path) -> Evaluation:
+    """Evaluate like ``geogs eval``, without its pictures."""
+    return evaluate(EvalSettings(output=folder, gt=truth, samples=_SAMPLES, plots=False))
+
+
+def _surface_figures(found: Evaluation, prefix: str) -> dict[str, float]:
+    """Errors of the surface by the names of an outcome; empty if there is none to compare."""
+    scores = found.reconstruction
+    if scores is None:
+        return {}
+    if not isinstance(scores, ReconstructionScores):
+        raise InputError("the board compares surfaces by area.")
+    return {
+        f"{prefix}accuracy": scores.accuracy_cm,
+        f"{prefix}completeness": scores.completeness_ratio,
+        f"{prefix}f_score": scores.f_score,
+    }

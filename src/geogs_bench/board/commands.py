@@ -13,6 +13,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # as a script it knows no packages
+    from geogs_bench.board.with_constant import Constant
 
 
 @dataclass(frozen=True)
@@ -28,15 +32,24 @@ class Spent:
     """Peak memory of it, or of one of these processes."""
 
 
-def run_geogs(arguments: Sequence[str], log: Path, caches: Path | None = None) -> tuple[Spent, str]:
+def run_geogs(
+    arguments: Sequence[str],
+    log: Path,
+    caches: Path | None = None,
+    changed: "tuple[Constant, float] | None" = None,
+) -> tuple[Spent, str]:
     """Run ``geogs`` to its end; return its time and memory, and the last line of its output.
 
     Args:
         arguments: of the command.
         log: file for its output.
         caches: folder for new, empty caches of compiled code; the usual ones if none is given.
+        changed: a constant with another value.
     """
-    command = [sys.executable, "-m", "geogs.cli.main", *arguments]
+    program = ["geogs.cli.main"]
+    if changed is not None:
+        program = ["geogs_bench.board.with_constant", str(changed[0]), repr(changed[1])]
+    command = [sys.executable, "-m", *program, *arguments]
     found = dict(os.environ)
     for name in () if caches is None else ("NUMBA_CACHE_DIR", "GEOGS_CACHE"):
         found[name] = tempfile.mkdtemp(prefix=f"{name.lower()}-", dir=caches)

@@ -72,24 +72,14 @@ class Difference:
 
 def compare(before: BoardRecord, now: BoardRecord) -> list[Difference]:
     """Find the figures that changed by more than their noise, the worse ones first."""
-    found = [
-        difference
-        for row in now.rows
-        if (earlier := before.row(row.name)) is not None and _are_alike(earlier, row)
-        for difference in _differences(earlier, row, _has_same_clock(before, now, row))
-    ]
+    found: list[Difference] = []
+    is_same_machine = before.machine == now.machine and before.device == now.device
+    for row in now.rows:
+        earlier = before.row(row.name)
+        if earlier and (earlier.command, earlier.footage) == (row.command, row.footage):
+            # Wall-clock times cannot be compared where a command waits for concurrent ones.
+            found += _differences(earlier, row, is_same_machine and row.runs_alone)
     return sorted(found, key=lambda difference: not difference.is_worse)
-
-
-def _are_alike(before: RowRecord, now: RowRecord) -> bool:
-    """Whether two rows have the same command and footage."""
-    return before.command == now.command and before.footage == now.footage
-
-
-def _has_same_clock(before: BoardRecord, now: BoardRecord, row: RowRecord) -> bool:
-    """Whether wall-clock times can be compared: a command waits for concurrent ones."""
-    is_same = before.machine == now.machine and before.device == now.device
-    return is_same and row.runs_alone
 
 
 def _differences(before: RowRecord, now: RowRecord, same_clock: bool) -> Iterator[Difference]:
@@ -128,3 +118,38 @@ def _difference(
 def _squares(values: Sequence[float]) -> float:
     """Sum of squared differences from the mean."""
     return float(np.square(np.asarray(values) - np.mean(values)).sum())
+
+
+def markdown(board: BoardRecord, changes: Sequence[Difference]) -> str:
+    """The board as Markdown, with the failures and the changes."""
+    failures = [f"- {row.name}: {why}" for row in board.rows for why in dict.fromkeys(row.failures)]
+    lines = [
+        "# The board",
+        "",
+        f"geogs {board.commit}; {board.machine}; {board.device}; {board.side_by_side} commands "
+        "at a time. Means over three seeds ± their standard deviation; cost: seconds of the "
+        "processor over those of a fixed computation.",
+        "",
+        f"| {' | '.join(['row', *(figure.title for figure in FIGURES)])} |",
+        f"|---|{'---:|' * len(FIGURES)}",
+        *(_line(row) for row in board.rows),
+        "",
+        *failures,
+        *(f"- {change}" for change in changes),
+    ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _line(row: RowRecord) -> str:
+    return f"| {' | '.join([row.name, *(_cell(row, figure) for figure in FIGURES)])} |"
+
+
+def _cell(row: RowRecord, figure: Figure) -> str:
+    values = row.values(figure.name)
+    if not values:
+        return "-"
+    text = f"{np.mean(values):.{figure.digits}f}"
+    spread = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    if spread < 0.5 * 10**-figure.digits:
+        return text
+    return f"{text} ± {spread:.{figure.digits}f}"

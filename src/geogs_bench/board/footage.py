@@ -81,7 +81,8 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
         OutputError: it cannot be written.
     """
     size = footage.on_gpu if on_gpu else footage.on_cpu
-    folder, made_of = root / footage.name, repr(replace(footage, on_cpu=size, on_gpu=size))
+    folder = root / footage.name
+    made_of = repr(replace(footage, on_cpu=size, on_gpu=size))
     missing = [i for i in range(size.frames) if _is_missing(i / size.frames, footage)]
     used = f"--stride {size.stride}" if size.stride > 1 else ""
     title = (
@@ -123,7 +124,8 @@ def find(footage: KeptFootage, root: Path | None, on_gpu: bool) -> FootagePlace 
 def frames_used(command: Sequence[str], frames: int) -> int:
     """Number of frames that a command uses of a sequence of ``frames``, by its options."""
     said = dict(pairwise(command))
-    start, stride = int(said.get("--start", 0)), int(said.get("--stride", 1))
+    start = int(said.get("--start", 0))
+    stride = int(said.get("--stride", 1))
     return len(range(start, min(frames, int(said.get("--stop", frames))), stride))
 
 

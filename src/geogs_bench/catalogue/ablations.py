@@ -7,8 +7,7 @@ from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.catalogue.variants import DEFAULT, ONLINE_RESULTS, PAPER, with_paper
 from geogs_bench.data.benchmark_scene import Option
 from geogs_bench.data.motion_cells import ROOM, relighted
-from geogs_bench.data.posed_scenes import find_any_posed
-from geogs_bench.data.replica_scenes import find_relighted, find_rooms
+from geogs_bench.data.scenes import find_any_posed, find_relighted, find_rooms
 from geogs_bench.tables.columns import (
     COST,
     area_layout,
@@ -143,12 +142,7 @@ LOSSES = Benchmark(
     find_any_posed,
     _POSED,
     _WHERE,
-    (
-        dtu_layout(paper.ABLATION_LOSSES),
-        area_layout(posed=True),
-        vertex_layout(posed=True),
-        COST,
-    ),
+    (dtu_layout(paper.ABLATION_LOSSES), area_layout(posed=True), vertex_layout(posed=True), COST),
     (
         Variant("all", _ALL_LOSSES),
         *(

@@ -4,12 +4,15 @@ from geogs_bench import published as paper
 from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.catalogue.variants import DEFAULT, ONLINE, PAPER, PIPELINES
 from geogs_bench.data.benchmark_scene import Option
-from geogs_bench.data.depth_scenes import CELLS, find_depth
-from geogs_bench.data.dtu_scenes import find_dtu
-from geogs_bench.data.motion_cells import FULL, ROOM, SMALL, find_motions
-from geogs_bench.data.posed_scenes import find_objects, find_posed_rooms
-from geogs_bench.data.replica_scenes import find_replica, find_rooms
-from geogs_bench.data.sequence_scenes import (
+from geogs_bench.data.motion_cells import DEPTH_CELLS, FULL, ROOM, SMALL
+from geogs_bench.data.scenes import (
+    find_depth,
+    find_dtu,
+    find_motions,
+    find_objects,
+    find_posed_rooms,
+    find_replica,
+    find_rooms,
     find_scannet,
     find_scannetpp,
     find_seven_scenes,
@@ -220,7 +223,7 @@ EDGES = Benchmark(
         "The mesh is seen from the estimated poses, after one scale for the whole sequence, so "
         "that errors of the trajectory do not count.",
     ),
-    cells=CELLS,
+    cells=DEPTH_CELLS,
 )
 
 OBJECTS = Benchmark(

@@ -17,10 +17,14 @@ from geogs_bench.catalogue.ablations import (
 from geogs_bench.catalogue.data_sets import DTU, REPLICA, RGBD, SCANNET, SCANNETPP
 from geogs_bench.catalogue.variants import PAPER, with_paper
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
-from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.motion_cells import ROOM, Cell, relighted
-from geogs_bench.data.posed_scenes import find_objects, find_posed_rooms
-from geogs_bench.data.replica_scenes import find_relighted, find_rooms
+from geogs_bench.data.scenes import (
+    find_dtu,
+    find_objects,
+    find_posed_rooms,
+    find_relighted,
+    find_rooms,
+)
 from geogs_synth.camera.flaws import camera_flaws
 
 

@@ -1,4 +1,4 @@
-"""The matrix of motions and cameras that ``geogs bench motions`` renders and finds again."""
+"""Synthetic sequences that benchmarks render: rooms, and the matrix of motions and cameras."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING
 
 from geogs.errors import InputError
 from geogs.threads import available_cores
-from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
-from geogs_bench.data.scene_folders import folders_like
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
-from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
-from geogs_synth.scene.lamp_kinds import LampKind
+from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, LampKind, MotionKind
 
 if TYPE_CHECKING:
     from geogs_synth.raycast.raycaster import Raycaster
@@ -55,17 +52,13 @@ PLACES: tuple[MotionKind, ...] = ("handheld", "dining", "driving", "corridor")
 
 
 def _cell(
-    motion: MotionKind,
-    camera: CameraKind,
-    frames: int,
-    size: tuple[int, int],
-    moving: float = 0.0,
+    motion: MotionKind, camera: CameraKind, frames: int, size: tuple[int, int], moving: float = 0.0
 ) -> Cell:
     name = f"{motion}-{camera}" + (f"-moving-{100 * moving:.0f}" if moving else "")
     return Cell(name, motion, camera_flaws(camera), frames, *size, moving)
 
 
-def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
+def _single_flaws() -> tuple[Cell, ...]:
     """Rotations at 60 degrees a second, each with one flaw of the Kinect."""
     flaws = {
         "readout": Flaws(readout=0.03),
@@ -75,21 +68,14 @@ def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
         "noise": Flaws(noise=5.0, jpeg=60),
     }
     return tuple(
-        Cell(f"turning-60-{name}", "turning-60", flaw, frames, *size)
+        Cell(f"turning-60-{name}", "turning-60", flaw, 120, *_LARGER)
         for name, flaw in flaws.items()
     )
 
 
-def _moving_lenses(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
-    """A lens whose focal length varies by 2 % to either side, and a stabilised one."""
-    return (
-        Cell("handheld-focusing", "handheld", Flaws(focusing=0.02), frames, *size),
-        Cell("walking-stabilised", "walking", Flaws(stabilisation=0.015), frames, *size),
-    )
-
-
-_QVGA, _LARGER = (320, 240), (400, 300)
-_SMALL_STREET, _STREET = (496, 150), (800, 242)
+_QVGA = (320, 240)
+_LARGER = (400, 300)
+_STREET = (800, 242)
 
 SMALL: tuple[Cell, ...] = (
     _cell("handheld", "clean", 75, _QVGA),
@@ -103,26 +89,43 @@ SMALL: tuple[Cell, ...] = (
     _cell("rest-start", "clean", 90, _QVGA),
     _cell("jerks", "clean", 75, _QVGA),
     _cell("still", "kinect", 30, _QVGA),
-    _cell("driving", "clean", 60, _SMALL_STREET),
+    _cell("driving", "clean", 60, (496, 150)),
     _cell("corridor", "kinect", 60, _QVGA),
 )
 """Cells for two CPU cores."""
 
 FULL: tuple[Cell, ...] = (
-    *(_cell(motion, camera, 120 if motion != "handheld-5hz" else 70, _LARGER)
-      for motion in ROOM_MOTIONS for camera in ("clean", "phone", "kinect")),
-    *_single_flaws(120, _LARGER),
-    *_moving_lenses(120, _LARGER),
+    *(
+        _cell(motion, camera, 120 if motion != "handheld-5hz" else 70, _LARGER)
+        for motion in ROOM_MOTIONS
+        for camera in ("clean", "phone", "kinect")
+    ),
+    *_single_flaws(),
+    # A lens whose focal length varies by 2 % to either side, and a stabilised one.
+    Cell("handheld-focusing", "handheld", Flaws(focusing=0.02), 120, *_LARGER),
+    Cell("walking-stabilised", "walking", Flaws(stabilisation=0.015), 120, *_LARGER),
     _cell("handheld", "action", 120, _LARGER),
-    *(_cell(motion, "clean", 120, _LARGER, moving)
-      for motion in ("handheld", "walking") for moving in (0.15, 0.33)),
+    *(
+        _cell(motion, "clean", 120, _LARGER, moving)
+        for motion in ("handheld", "walking")
+        for moving in (0.15, 0.33)
+    ),
     _cell("handheld", "phone", 120, _LARGER, 0.33),
     _cell("driving", "clean", 125, _STREET),
     _cell("driving", "action", 125, _STREET),
     _cell("driving", "clean", 125, _STREET, 0.15),
     *(_cell("corridor", camera, 120, _LARGER) for camera in ("clean", "phone", "kinect")),
-)  # fmt: skip
+)
 """All motions, all flaws."""
+
+DEPTH_CELLS: tuple[Cell, ...] = (
+    Cell("room-0", "handheld", Flaws(), 100, 400, 300),
+    Cell("room-1", "handheld", Flaws(), 100, 400, 300, seed=1),
+    Cell("dining-0", "dining", Flaws(), 100, 400, 300),
+    Cell("dining-1", "dining", Flaws(), 100, 400, 300, seed=1),
+    Cell("street-0", "driving", Flaws(), 60, 496, 150),
+)
+"""Cells whose depth is compared: rooms, rooms of thin things, a street."""
 
 
 def render_cells(
@@ -150,18 +153,6 @@ def render_cells(
     return folder
 
 
-def find_motions(root: Path) -> list[BenchmarkScene]:
-    """Find every sequence below ``root``, or ``root`` itself if it is one."""
-    return [
-        BenchmarkScene(folder.resolve().name, folder, Truth(poses=folder), kind="motion")
-        for folder in folders_like(root, _is_sequence)
-    ]
-
-
-def _is_sequence(folder: Path) -> bool:
-    return (folder / "cam_params.json").is_file() and (folder / "traj.txt").is_file()
-
-
 def _is_there(cell: Cell, folder: Path) -> bool:
     """Whether a cell is complete: the points are written last."""
     return any((folder / cell.name).glob("points_seen_*.ply"))
@@ -178,7 +169,15 @@ def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
     from geogs_synth.sequence.replica_files import write_sequence
 
     write_sequence(
-        folder, cell.frames, cell.width, cell.height, cell.seed,
-        motion=cell.motion, flaws=cell.flaws, moving=cell.moving, lamps=cell.lamps,
-        threads=available_cores(), raycaster=raycaster,
-    )  # fmt: skip
+        folder,
+        cell.frames,
+        cell.width,
+        cell.height,
+        cell.seed,
+        motion=cell.motion,
+        flaws=cell.flaws,
+        moving=cell.moving,
+        lamps=cell.lamps,
+        threads=available_cores(),
+        raycaster=raycaster,
+    )

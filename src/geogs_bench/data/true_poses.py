@@ -32,7 +32,8 @@ def _of_video(model: Path) -> Trajectory:
     """Poses of a COLMAP model; the last number in the name of an image is its frame."""
     found = {}
     for image in read_model(model).images.values():
-        digits, T_cw = re.findall(r"\d+", Path(image.name).stem), pose_of(image)
+        digits = re.findall(r"\d+", Path(image.name).stem)
+        T_cw = pose_of(image)
         if digits and np.isfinite(T_cw).all():
             found[int(digits[-1])] = T_cw
     T_cw = np.array([found[k] for k in sorted(found)]).reshape(-1, 4, 4)

@@ -15,8 +15,11 @@ from geogs.types import Trajectory
 from geogs_bench.results.record import StageName
 
 _STAGE_FOLDERS: dict[StageName, str] = {
-    "online": "online", "adjusted": "adjusted", "depth fusion": "depth_fusion", "final": "",
-}  # fmt: skip
+    "online": "online",
+    "adjusted": "adjusted",
+    "depth fusion": "depth_fusion",
+    "final": "",
+}
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,11 @@ class ResultFolder:
         folders = {stage: self.path / name for stage, name in _STAGE_FOLDERS.items()}
         if self.summary.get("refined", True):
             return folders
-        return {"online": folders["online"], "depth fusion": folders["depth fusion"],
-                "adjusted": folders["final"]}  # fmt: skip
+        return {
+            "online": folders["online"],
+            "depth fusion": folders["depth fusion"],
+            "adjusted": folders["final"],
+        }
 
     def _file(self, stage: StageName | None, name: str) -> Path | None:
         folder = self.path if stage is None else self._folders.get(stage)

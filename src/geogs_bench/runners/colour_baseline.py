@@ -4,22 +4,28 @@ import importlib.util
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from geogs.application.run_settings import ReconstructSettings
 from geogs.config import MeshConfig
 from geogs.errors import DeviceError, InputError
+from geogs.gpu.installation import require_device
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-
-if TYPE_CHECKING:
-    from geogs.io.sources.posed.posed_source import PosedSource
-    from geogs.mesh.triangle_mesh import Mesh
-    from geogs_bench.appearance.appearance_disks import AppearanceDisks
-    from geogs_bench.appearance.appearance_trainer import AppearanceResult
-    from geogs_bench.appearance.training_views import TrainingView
-    from geogs_photos.start_points import StartPoints
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.trajectories import write_tum_trajectory
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.triangle_mesh import Mesh
+from geogs.types import Trajectory
+from geogs_bench.appearance.appearance_config import AppearanceConfig
+from geogs_bench.appearance.appearance_disks import AppearanceDisks
+from geogs_bench.appearance.appearance_trainer import AppearanceResult, AppearanceTrainer
+from geogs_bench.appearance.rasteriser import GsplatRasteriser, depth_views
+from geogs_bench.appearance.training_views import TrainingView, training_views
+from geogs_photos.start_points import StartPoints, find_start_points
 
 _BUDGET = 120.0
 """Default training time in seconds; start points and mesh come on top."""
@@ -43,15 +49,9 @@ def train_baseline(settings: ReconstructSettings) -> None:
         InputError: the source cannot be read, or has too little texture.
         DeviceError: there is no NVIDIA GPU, or its memory is full.
     """
-    import torch
-
-    from geogs.gpu.installation import require_device
-    from geogs.io.sources.sniff import open_posed_source
-    from geogs_bench.appearance.training_views import training_views
-    from geogs_photos.start_points import find_start_points
-
     assert settings.output is not None, "a task has a folder"
-    device, config = require_device(settings.device), settings.config
+    device = require_device(settings.device)
+    config = settings.config
     if device.type != "cuda":
         raise DeviceError("the baseline with colour needs an NVIDIA GPU.")
     source = open_posed_source(settings.source, config.input, settings.hold_out)
@@ -84,33 +84,26 @@ def train_baseline(settings: ReconstructSettings) -> None:
 def _train(
     output: Path,
     settings: ReconstructSettings,
-    views: "list[TrainingView]",
-    points: "StartPoints",
+    views: list[TrainingView],
+    points: StartPoints,
     device: str,
     seconds: dict[str, float],
-) -> "tuple[AppearanceResult, Mesh]":
+) -> tuple[AppearanceResult, Mesh]:
     """Train, and write a mesh at each snapshot; the times of both parts go into ``seconds``.
 
     Meshes are made by the same fusion as the system's own maps.
     """
-    import torch
-
-    from geogs.mesh.extract import extract_mesh
-    from geogs_bench.appearance.appearance_config import AppearanceConfig
-    from geogs_bench.appearance.appearance_trainer import AppearanceTrainer
-    from geogs_bench.appearance.crossing_depth import depth_views
-    from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
-
-    config, given = AppearanceConfig(), settings.config
+    config = AppearanceConfig()
+    given = settings.config
     surface = MeshConfig(voxel=given.mesh.voxel, truncation=given.mesh.truncation)
     rasteriser = GsplatRasteriser(config.near)
 
-    def meshed(disks: "AppearanceDisks") -> "Mesh":
+    def meshed(disks: AppearanceDisks) -> Mesh:
         return extract_mesh(depth_views(disks, views, rasteriser, config), surface)
 
-    def snapshot(at: float, disks: "AppearanceDisks") -> None:
+    def snapshot(at: float, disks: AppearanceDisks) -> None:
         folder = prepare_output_folder(output / "snapshots" / f"{at:g}")
-        _write_mesh(folder / "mesh.ply", meshed(disks))
+        meshed(disks).save(folder / "mesh.ply")
 
     trainer = AppearanceTrainer(
         views, points.positions, points.colours, rasteriser, config, given.seed, device
@@ -128,19 +121,9 @@ def _train(
     return result, mesh
 
 
-def _write(output: Path, source: "PosedSource", result: "AppearanceResult", mesh: "Mesh") -> None:
-    from geogs.io.writers.intrinsics_file import write_intrinsics
-    from geogs.io.writers.trajectories import write_tum_trajectory
-    from geogs.types import Trajectory
-
-    _write_mesh(output / "mesh.ply", mesh)
+def _write(output: Path, source: PosedSource, result: AppearanceResult, mesh: Mesh) -> None:
+    mesh.save(output / "mesh.ply")
     write_intrinsics(output / "intrinsics.json", source.camera, None)
     T_wc = np.linalg.inv(source.T_cw)
     poses = Trajectory(source.timestamps, T_wc, np.ones(len(T_wc), bool))
     write_tum_trajectory(output / "trajectory.tum", poses)
-
-
-def _write_mesh(path: Path, mesh: "Mesh") -> None:
-    from geogs.io.writers.ply_writer import write_mesh
-
-    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)

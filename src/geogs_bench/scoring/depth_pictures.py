@@ -19,12 +19,16 @@ DEPTH_TITLE = (
 )
 _WORST = 0.15
 """Relative error at which colours saturate."""
-_FRONT, _BEHIND = (200, 0, 0), (0, 60, 220)
-_MISSING, _UNKNOWN = (0, 0, 0), (128, 128, 128)
+_FRONT = (200, 0, 0)
+_BEHIND = (0, 60, 220)
 _COLOURS: dict[Place, tuple[int, int, int]] = {
-    "bare": (90, 190, 90), "grazing": (240, 150, 40), "edge": (240, 230, 60),
-    "behind thin": (60, 210, 220), "thin": (230, 40, 210), "sky": (80, 120, 230),
-}  # fmt: skip
+    "bare": (90, 190, 90),
+    "grazing": (240, 150, 40),
+    "edge": (240, 230, 60),
+    "behind thin": (60, 210, 220),
+    "thin": (230, 40, 210),
+    "sky": (80, 120, 230),
+}
 """Colours of the kinds of region; later ones are drawn over earlier ones."""
 
 
@@ -67,15 +71,17 @@ def error_colours(
 
     Holes are black, but in the sky, where a hole is right and a surface is too near.
     """
-    sky, unknown, hole = np.isinf(true), ~(true > 0), ~np.isfinite(found)
+    sky = np.isinf(true)
+    unknown = ~(true > 0)
+    hole = ~np.isfinite(found)
     depth = np.where(sky | unknown, 1.0, true)
     error = np.where(hole, 0.0, found) / depth - 1
     error = np.where(sky, np.where(hole, 0.0, -1.0), error)
     worst = np.where((error < 0)[..., None], _FRONT, _BEHIND)
     strength = np.minimum(np.abs(error) / _WORST, 1)[..., None]
     colours = 255 + strength * (worst - 255.0)
-    colours[hole & ~sky] = _MISSING
-    colours[unknown] = _UNKNOWN
+    colours[hole & ~sky] = 0
+    colours[unknown] = 128
     return np.asarray(colours.round().astype(np.uint8))
 
 

@@ -42,7 +42,8 @@ def score_motion(scene: BenchmarkScene, result: ResultFolder) -> MotionScore:
     claim = (result.summary.get("verdict") or {}).get("is_reliable")
     if estimate is None:
         return MotionScore(tracked=0.0, is_called_reliable=claim)
-    tracked, states = estimate.of("tracked"), result.states()
+    tracked = estimate.of("tracked")
+    states = result.states()
     turned = sum(state == "orientation only" for _, state, _ in states)
     return replace(
         compare_motion(reference, tracked, estimate),
@@ -63,7 +64,8 @@ def compare_motion(reference: Trajectory, tracked: Trajectory, oriented: Traject
     i, j = associate(reference.timestamps, tracked.timestamps, SAME_TIME)
     percentage = 100 * len(i) / len(reference.timestamps)
     score = MotionScore(percentage, rotation=_rotation(reference, oriented))
-    true, found = reference.T_wc[i, :3, 3], tracked.T_wc[j, :3, 3]
+    true = reference.T_wc[i, :3, 3]
+    found = tracked.T_wc[j, :3, 3]
     path = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
     if len(i) < 3 or path < _LEAST_PATH or (found == found[0]).all():
         return score

@@ -72,7 +72,8 @@ def score_surface(
     if truth.seen.is_mesh:
         vertices = evaluate_vertices(mesh, truth.seen, use_icp, seed=seed)
         scores.insert(0, in_cm("vertices", vertices.scores))
-    points, distance = area.reconstruction_points, area.accuracy
+    points = area.reconstruction_points
+    distance = area.accuracy
     return tuple(scores), SurfaceComparison(area.scores, mesh, truth.whole, points, distance)
 
 
@@ -99,7 +100,8 @@ def with_short_edges(mesh: Surface, longest: float) -> Surface:
     Halving keeps thin triangles few. Neighbours that are halved across their common edge share
     the new corner; a neighbour that is not keeps that edge whole.
     """
-    vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
+    vertices = mesh.vertices
+    faces = mesh.faces.astype(np.int64)
     while True:
         corners = vertices[faces]
         lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)

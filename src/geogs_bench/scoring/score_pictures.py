@@ -27,8 +27,10 @@ def draw(stages: Sequence[StageErrors], result: ResultFolder) -> None:
     """
     if not stages:
         return
-    trajectory, comparison = stages[-1].trajectory, stages[-1].comparison
-    folder, poses = result.path / "report", result.poses()
+    trajectory = stages[-1].trajectory
+    comparison = stages[-1].comparison
+    folder = result.path / "report"
+    poses = result.poses()
     T_wc = np.eye(4)[None] if poses is None else poses.T_wc
     if trajectory is not None:
         plots.plot_trajectory(folder / "bench_trajectory.png", trajectory)

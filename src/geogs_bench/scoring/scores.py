@@ -1,26 +1,39 @@
 """All scores of a result, by the command that made it."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.evaluation.surfaces.dtu_errors import DtuScores, evaluate_dtu, read_dtu_reference
+from geogs.evaluation.surfaces.object_errors import MAX_DISTANCE, ObjectScores, evaluate_object
 from geogs.evaluation.surfaces.photoconsistency import evaluate_photoconsistency
-from geogs.evaluation.surfaces.surface import read_surface
-from geogs.evaluation.true_scene import photographs
+from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks
+from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
+from geogs.evaluation.true_scene import silhouettes
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.map_file import load_map
-from geogs_bench.data.benchmark_scene import BenchmarkScene
-from geogs_bench.results.record import CurvePoint, PhotoScore, Record, StageScore
+from geogs_bench.data.benchmark_scene import BenchmarkScene, DtuTruth
+from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.results.record import CurvePoint, PhotoScore, Record, StageScore, SurfaceScore
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.depth_pictures import DEPTH_PICTURE, draw_depths
 from geogs_bench.scoring.depth_scores import score_depth
 from geogs_bench.scoring.motion_scores import score_motion
+from geogs_bench.scoring.room_scores import read_true_surface, score_surface
 from geogs_bench.scoring.score_pictures import draw
 from geogs_bench.scoring.slam_scores import StageErrors, score_slam
-from geogs_bench.scoring.surface_scorers import SurfaceScorer, surface_scorer
 
+SurfaceScorer = Callable[[Surface], tuple[tuple[SurfaceScore, ...], SurfaceComparison]]
+"""Scores of a mesh (the one to plot last) and its errors over the surface."""
+
+_MASK_EDGE = 1600
+"""Long edge of DTU's masks, pixels."""
 _LONG_EDGE = 800
 
 
@@ -70,13 +83,10 @@ def score_snapshots(scorer: SurfaceScorer, result: ResultFolder) -> tuple[CurveP
     for seconds, folder in result.snapshots():
         mesh = read_surface(folder / "mesh.ply")
         if mesh.is_mesh:
-            points.append(CurvePoint(seconds, _disks_of(folder), scorer(mesh)[0][-1]))
+            file = folder / "map.safetensors"
+            disks = len(load_map(file)) if file.is_file() else None
+            points.append(CurvePoint(seconds, disks, scorer(mesh)[0][-1]))
     return tuple(points)
-
-
-def _disks_of(folder: Path) -> int | None:
-    file = folder / "map.safetensors"
-    return len(load_map(file)) if file.is_file() else None
 
 
 def score_photo(scene: BenchmarkScene, result: ResultFolder) -> PhotoScore:
@@ -94,7 +104,7 @@ def score_photo(scene: BenchmarkScene, result: ResultFolder) -> PhotoScore:
         raise InputError(
             f"{scene.name} has no true surface, and the run held no image out by which to judge it."
         )
-    found = evaluate_photoconsistency(mesh, source.camera, photographs(source), held_out)
+    found = evaluate_photoconsistency(mesh, source.camera, list(source), held_out)
     return PhotoScore(
         found.score, found.ncc_mean, found.ncc_median, found.coverage, found.views, found.window
     )
@@ -105,3 +115,88 @@ def _indices(source: PosedSource, listed: list[int | str]) -> list[int]:
     names = {Path(source.label(i)).name: i for i in range(len(source))}
     found = [i if isinstance(i, int) else names.get(Path(i).name) for i in listed]
     return [i for i in found if i is not None and i < len(source)]
+
+
+def surface_scorer(scene: BenchmarkScene, result: ResultFolder, seed: int) -> SurfaceScorer | None:
+    """The scorer of a scene, its truth read once; none if the scene has no true surface.
+
+    Raises:
+        InputError: the truth cannot be read.
+    """
+    dtu = scene.truth.dtu
+    file = scene.truth.surface
+    if scene.kind == "scan":
+        return None if dtu is None else _scan_scorer(scene, dtu, seed)
+    if file is None:
+        return None
+    if scene.kind == "object":
+        return _object_scorer(scene, file, seed)
+    poses = read_true_poses(scene)
+    if poses is None:
+        raise InputError(f"{scene.name} has no true poses, which say what its camera saw.")
+    truth = read_true_surface(scene.truth, result.camera, np.linalg.inv(poses.T_wc))
+    assert truth is not None  # the scene has a surface
+    return lambda mesh: score_surface(mesh, truth, False, seed)
+
+
+def _object_scorer(scene: BenchmarkScene, file: Path, seed: int) -> SurfaceScorer:
+    truth = read_surface(file)
+    points = None if scene.truth.points is None else read_surface(scene.truth.points)
+    masks = _masks(scene)
+
+    def score(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
+        found = evaluate_object(mesh, truth, masks, points, seed=seed)
+        distance = np.minimum(found.accuracy, MAX_DISTANCE)  # those left out are infinite
+        compared_at = found.reconstruction_points
+        comparison = SurfaceComparison(found.scores, mesh, truth, compared_at, distance)
+        return (_of_object(found.scores),), comparison
+
+    return score
+
+
+def _scan_scorer(scene: BenchmarkScene, dtu: DtuTruth, seed: int) -> SurfaceScorer:
+    reference = read_dtu_reference(dtu.folder, dtu.scan)
+    masks = _masks(scene)
+
+    def score(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
+        found = evaluate_dtu(cull_by_masks(mesh, masks), reference, seed)
+        points = found.reconstruction_points
+        distance = found.accuracy / 1000
+        comparison = SurfaceComparison(found.scores, mesh, None, points, distance)
+        return (_of_scan(found.scores),), comparison
+
+    return score
+
+
+def _masks(scene: BenchmarkScene) -> list[Silhouette]:
+    """The masks of all images, dilated by DTU's protocol; empty if images have none."""
+    source = open_posed_source(scene.source, InputConfig(long_edge=_MASK_EDGE))
+    return [mask.dilated() for mask in silhouettes(source) or ()]
+
+
+def _of_object(scores: ObjectScores) -> SurfaceScore:
+    return SurfaceScore(
+        weighting="area",
+        unit="mm",
+        accuracy=scores.accuracy_mm,
+        completeness=scores.completeness_mm,
+        chamfer=scores.chamfer_mm,
+        ratio=scores.recall,
+        precision=scores.precision,
+        f_score=scores.f_score,
+        threshold=scores.threshold_mm,
+        accuracy_median=scores.accuracy_median_mm,
+        completeness_median=scores.completeness_median_mm,
+    )
+
+
+def _of_scan(scores: DtuScores) -> SurfaceScore:
+    return SurfaceScore(
+        weighting="points",
+        unit="mm",
+        accuracy=scores.d2s_mm,
+        completeness=scores.s2d_mm,
+        chamfer=scores.overall_mm,
+        accuracy_median=scores.d2s_median_mm,
+        completeness_median=scores.s2d_median_mm,
+    )

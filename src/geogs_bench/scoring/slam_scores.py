@@ -12,11 +12,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses
 from geogs_bench.results.record import StageName, StageScore, SurfaceScore, TrajectoryScore
 from geogs_bench.results.result_folder import ResultFolder
-from geogs_bench.scoring.room_scores import (
-    TrueSurface,
-    read_true_surface,
-    score_surface,
-)
+from geogs_bench.scoring.room_scores import TrueSurface, read_true_surface, score_surface
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,8 @@ def _stage(
             errors.ate_rmse_cm, errors.pairs, errors.scale, _ate(keyframes, reference), rigid
         )
     scores: tuple[SurfaceScore, ...] = ()
-    comparison, mesh = None, result.mesh(stage)
+    comparison = None
+    mesh = result.mesh(stage)
     if surface is not None and mesh is not None and mesh.is_mesh:
         scores, comparison = score_surface(mesh.transformed(errors.T_ref_est), surface, True, seed)
     return StageErrors(StageScore(stage, trajectory, scores), errors, comparison)

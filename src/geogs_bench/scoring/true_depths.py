@@ -103,7 +103,8 @@ def _has_pose(frame: Frame, poses: Trajectory) -> bool:
 
 
 def _from_images(scene: BenchmarkScene, source: Source, frames: list[Frame]) -> list[TrueView]:
-    is_exact, has_sky = source.kind == "replica", _is_outdoors(scene.source)
+    is_exact = source.kind == "replica"
+    has_sky = _is_outdoors(scene.source)
     views = []
     for frame in frames:
         depth = None if frame.depth is None else frame.depth.metres()

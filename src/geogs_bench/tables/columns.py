@@ -5,14 +5,7 @@ from typing import Literal
 
 from geogs_bench.benchmark import Column, Layout, Published
 from geogs_bench.published import PublishedTable
-from geogs_bench.results.record import (
-    PLACES,
-    Place,
-    Record,
-    StageName,
-    SurfaceScore,
-    Weighting,
-)
+from geogs_bench.results.record import PLACES, Place, Record, StageName, SurfaceScore, Weighting
 
 Value = Callable[[Record], float | None]
 """Value of a column for a record."""
@@ -115,10 +108,7 @@ def rgbd_layout(
 
 
 def surface_layout(
-    weighting: Weighting,
-    title: str,
-    published: PublishedTable | None = None,
-    posed: bool = False,
+    weighting: Weighting, title: str, published: PublishedTable | None = None, posed: bool = False
 ) -> Layout:
     """Errors of the surface at each stage, with published figures beside the paper's stage.
 
@@ -200,18 +190,22 @@ _PLACES: tuple[tuple[str, str, str, int], ...] = (
     ("Within 5 % of the true depth (% of the pixels; holes are wrong)", "within_5", "", 1),
     ("Within 2 % of the true depth (% of the pixels; holes are wrong)", "within_2", "", 1),
     (
-        "Surface in front of the true one by more than 5 % (% of the pixels)", "in_front",
-        "Fringes around things, and sheets that close the gaps between them.", 2,
+        "Surface in front of the true one by more than 5 % (% of the pixels)",
+        "in_front",
+        "Fringes around things, and sheets that close the gaps between them.",
+        2,
     ),
     ("Surface behind the true one by more than 5 % (% of the pixels)", "behind", "", 2),
     (
-        "Covered (% of the pixels)", "covered",
-        "In the sky: where a surface is that should not be there.", 1,
+        "Covered (% of the pixels)",
+        "covered",
+        "In the sky: where a surface is that should not be there.",
+        1,
     ),
     ("Median error of the depth (%), where there is a surface", "median_error", "", 2),
     ("Median error of the normals (degrees)", "normal", "", 1),
     ("Share of all pixels whose depth is known (%)", "share", "Kinds overlap.", 2),
-)  # fmt: skip
+)
 """Title, field, note and digits of every table of depth by kind of region."""
 
 
@@ -250,8 +244,9 @@ def curve_layout(seconds: Sequence[int]) -> Layout:
     """Error of the surface after ``seconds``, and of the result."""
 
     def after(moment: int) -> Value:
-        return _of(lambda r: next((p.surface for p in r.curve if p.seconds == moment), None),
-                   "chamfer")  # fmt: skip
+        return _of(
+            lambda r: next((p.surface for p in r.curve if p.seconds == moment), None), "chamfer"
+        )
 
     moments = (Column(f"CD after {s} s ({{unit}})", after(s)) for s in seconds)
     result = Column("CD of the result ({unit})", _of(_surface_of_result, "chamfer"))

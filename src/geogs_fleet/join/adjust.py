@@ -5,13 +5,14 @@ step of all poses goes back to the parts, which update their depths. So it is on
 everything, whose matches and depths stay in files.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
@@ -42,29 +43,6 @@ _NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
 """Image of a keyframe whose matches are known."""
 
 
-@dataclass(frozen=True)
-class StepJob:
-    """Job of a part after a step of all poses: update its depths, form its next equations."""
-
-    own: Member
-    others: tuple[Member, ...]
-    """All parts with links to this one."""
-    first: Mapping[int, int]
-    """Index of the first keyframe of each part among all keyframes."""
-    matches: tuple[Path, ...]
-    """Files of the edges whose source is one of its keyframes."""
-    camera: Camera
-    config: Config
-    after: Path
-    """File to write the depths to."""
-    T_before: Float[Tensor, "m 4 4"] | None
-    """Poses of all keyframes before the step; none if there was no step yet."""
-    step: Float[Tensor, "m 6"] | None
-    """Step of their poses."""
-    is_last: bool = False
-    """Form no further equations; fill cells without matches, and find dynamic cells."""
-
-
 def adjusted(
     parts: Sequence[Part],
     files: Sequence[Path],
@@ -87,7 +65,7 @@ def adjusted(
     adjustment = _Adjustment(now, gauge.linked, camera, config, workers, folder)
     folder.mkdir(parents=True, exist_ok=True)
     for _ in range(ROUNDS):
-        if adjustment.match() <= CONVERGED * adjustment.pairs:
+        if not adjustment.match():
             break
         adjustment.solve()
     return {n: replace(placements[n], T_cw=member.T_cw) for n, member in adjustment.members.items()}
@@ -114,27 +92,26 @@ class _Adjustment:
         workers: Workers,
         folder: Path,
     ) -> None:
-        self.members, self.linked, self.folder = members, linked, folder
-        self.camera, self.config, self.workers = camera, config, workers
+        self.members = members
+        self.linked = linked
+        self.folder = folder
+        self.camera = camera
+        self.config = config
+        self.workers = workers
         counts = np.cumsum([0, *(len(m.T_cw) for m in members.values())]).tolist()
         self.first = dict(zip(members, counts[:-1], strict=True))
-        self.keyframes = counts[-1]
         self.matches: dict[tuple[int, int], Path] = {}
         """Files of the edges that leave the keyframes of the second part, matched by the first."""
         self.ends = np.zeros((0, 4), np.int64)
         self.steps = 0
         """Number of steps of all poses so far."""
-        self.written = 0
-        """Number of files so far, so that each gets a unique name."""
+        self.numbers = itertools.count(1)
+        """Numbers of the files, so that each gets a unique name."""
 
-    @property
-    def pairs(self) -> int:
-        """Number of matched pairs of keyframes."""
-        return len(self.ends) // 2
-
-    def match(self) -> int:
-        """Match the pairs that have moved; return their number."""
-        jobs, written = [], []
+    def match(self) -> bool:
+        """Match the pairs that have moved; return whether enough have for another adjustment."""
+        jobs = []
+        written = []
         for n, own in self.members.items():
             later = [m for m in self.linked[n] if m > n]
             paths = {(n, m): self._new(f"matches-{n}-{m}") for m in (n, *later)}
@@ -147,13 +124,14 @@ class _Adjustment:
             path.unlink()
         self.matches = {key: path for paths in written for key, path in paths.items()}
         self.ends = np.concatenate([f.ends for f in found])
-        return sum(f.fresh for f in found)
+        return sum(f.fresh for f in found) > CONVERGED * (len(self.ends) // 2)
 
     def solve(self) -> None:
         """Take Gauss-Newton steps until they are small, then update the depths."""
-        poses = _AllPoses(self)
+        T_cw = torch.cat([member.T_cw for member in self.members.values()])
+        problem = _AllPoses(self, torch.arange(len(T_cw)) > 0)
         # The cost after a step is not evaluated: that would need another pass over all files.
-        found = minimise(_Poses(self.poses()), poses.linearise, poses.step, GLOBAL_OPTIONS.policy)
+        found = minimise(_Poses(T_cw), problem.linearise, problem.step, GLOBAL_OPTIONS.policy)
         if found.finite:
             self.follow(found.state, is_last=True)
 
@@ -175,40 +153,32 @@ class _Adjustment:
     def follow(self, poses: "_Poses", is_last: bool = False) -> list[PoseSums | None]:
         """Update the depths after a step; return the parts' equations for the next one."""
         jobs = []
+        files = {n: self._new(f"depths-{n}") for n in self.members}
         for n, own in self.members.items():
             others = tuple(self.members[m] for m in self.linked[n])
             leaving = tuple(path for (_, m), path in self.matches.items() if m == n)
             first = {m: self.first[m] for m in (n, *self.linked[n])}
             jobs.append(
-                StepJob(
-                    own, others, first, leaving, self.camera, self.config,
-                    self._new(f"depths-{n}"), poses.before, poses.step, is_last,
-                )
-            )  # fmt: skip
+                (own, others, first, leaving, self.camera, self.config, files[n], poses, is_last)
+            )
         self.steps += poses.step is not None
-        said = self.workers.map(f"adjusting, {self.steps} steps", follow, [(job,) for job in jobs])
-        for job in jobs:
-            if job.own.adjusted is not None:
-                job.own.adjusted.unlink()
-            self.members[job.own.number] = replace(job.own, adjusted=job.after)
-        return said
-
-    def poses(self) -> Float[Tensor, "m 4 4"]:
-        """Poses of all keyframes."""
-        return torch.cat([member.T_cw for member in self.members.values()])
+        equations = self.workers.map(f"adjusting, {self.steps} steps", follow, jobs)
+        for n, own in self.members.items():
+            if own.adjusted is not None:
+                own.adjusted.unlink()
+            self.members[n] = replace(own, adjusted=files[n])
+        return equations
 
     def _new(self, name: str) -> Path:
         """A new file for a job's output: a repeated job finds the same input as the first time."""
-        self.written += 1
-        return self.folder / f"{name}-{self.written}.safetensors"
+        return self.folder / f"{name}-{next(self.numbers)}.safetensors"
 
 
 class _AllPoses:
     """The least-squares problem of all poses; the parts keep the depths."""
 
-    def __init__(self, adjustment: _Adjustment) -> None:
+    def __init__(self, adjustment: _Adjustment, free: Bool[Tensor, "m"]) -> None:
         self.adjustment = adjustment
-        free = torch.arange(adjustment.keyframes) > 0
         self.system = SparseCameraSystem(*adjustment.ends_of_edges(), free)
 
     def linearise(self, state: _Poses) -> SparseCameraSystem:
@@ -233,62 +203,90 @@ class _AllPoses:
 
 
 @on_one_torch_thread
-def follow(job: StepJob) -> PoseSums | None:
+def follow(
+    member: Member,
+    others: tuple[Member, ...],
+    first: Mapping[int, int],
+    matches: tuple[Path, ...],
+    camera: Camera,
+    config: Config,
+    after: Path,
+    poses: _Poses,
+    is_last: bool,
+) -> PoseSums | None:
     """Update the depths of a part after a step and write them; return its next equations.
 
     These use the indices among all keyframes; none after the last step.
+
+    Args:
+        member: the part.
+        others: all parts with links to it.
+        first: index of the first keyframe of each part among all keyframes.
+        matches: files of the edges whose source is one of its keyframes.
+        camera: of all keyframes.
+        config: settings of the matching.
+        after: file to write the depths to.
+        poses: of all keyframes, with their last step, if there was one.
+        is_last: form no further equations; fill cells without matches, and find dynamic cells.
     """
-    grid, options = SampleGrid(job.camera), GLOBAL_OPTIONS
-    graph, nodes = _known_graph(job, grid)
-    own = graph.keyframes.ids[: len(job.own.T_cw)]
+    grid = SampleGrid(camera)
+    graph, nodes = _known_graph(member, others, matches, config, grid)
+    own = graph.keyframes.ids[: len(member.T_cw)]
     problem, ids = graph.streamed_problem(list(graph.edges), [], own)
     problem = replace(problem, free_pose=torch.ones(len(ids), dtype=torch.bool))
-    schur = StreamedSchur(problem, grid, options)
-    numbers = torch.tensor([job.first[part] + place for part, place in (nodes[k] for k in ids)])
+    schur = StreamedSchur(problem, grid, GLOBAL_OPTIONS)
+    numbers = torch.tensor([first[part] + place for part, place in (nodes[k] for k in ids)])
     d = problem.inverse_depth
-    if job.step is not None and job.T_before is not None:
-        before, step = BundleState(job.T_before[numbers], d), job.step[numbers]
+    if poses.step is not None and poses.before is not None:
+        before = BundleState(poses.before[numbers], d)
+        step = poses.step[numbers]
         delta = schur.depth_steps(before, schur.system, step.reshape(-1))
         d = stepped_depths(problem, d + delta)
     information = graph.keyframes.informations(own)
     sums: PoseSums | None = None
-    if not job.is_last:
+    if not is_last:
         schur.add_matches(BundleState(problem.T_cw, d))
         sources = torch.unique(problem.source)
         information[sources] = schur.information[sources]
         sums = schur.system.sums(numbers)
     depth = d[: len(own)]
-    if job.is_last:
+    if is_last:
         depth = grid_fields(grid).fill(depth, information)
         for id, field in zip(own, depth, strict=True):
             graph.keyframes[id].inverse_depth = field
-        graph.update_dynamic(set(own), job.config.tracking.moving)
+        graph.update_dynamic(set(own), config.tracking.moving)
     none = torch.zeros(grid.size, dtype=torch.bool)
     moving = [graph.keyframes[id].moving for id in own]
     held = torch.stack([none if m is None else m for m in moving])
-    write_record(job.after, Depths(depth.contiguous(), information, held))
+    write_record(after, Depths(depth.contiguous(), information, held))
     return sums
 
 
-def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]]:
+def _known_graph(
+    own: Member,
+    others: tuple[Member, ...],
+    matches: tuple[Path, ...],
+    config: Config,
+    grid: SampleGrid,
+) -> tuple[FrameGraph, list[Node]]:
     """Graph of the edges that leave a part's keyframes, which come first; all keyframes' nodes."""
     edges: dict[Directed, PackedEdge] = {}
-    for path in job.matches:
+    for path in matches:
         edges |= read_record(Matches, path).edges()
     seen = {target for _, target in edges}
     segment = KeyframeTable.on(grid).new_set()
     nodes: list[Node] = []
     ids: dict[Node, int] = {}
-    for member in (job.own, *job.others):
+    for member in (own, *others):
         depths = member.depths()
         for node in member.nodes:
-            if member is not job.own and node not in seen:
+            if member is not own and node not in seen:
                 continue
             place = node[1]
             keyframe = segment.add(place, float(place), _NO_IMAGE, None, member.T_cw[place])
             depths.give(keyframe, place)
             ids[node] = keyframe.id
             nodes.append(node)
-    graph = FrameGraph(segment, build_operator(job.config.tracking, grid))
+    graph = FrameGraph(segment, build_operator(config.tracking, grid))
     graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in edges.items()})
     return graph, nodes

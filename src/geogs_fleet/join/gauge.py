@@ -38,13 +38,8 @@ class Gauge:
         return {n: sorted(others) for n, others in linked.items()}
 
 
-@dataclass(frozen=True)
-class _Tie:
-    """Two parts whose links agree."""
-
-    S: Float[Tensor, "4 4"]
-    """World of the first to that of the second."""
-    links: tuple[Link, ...]
+_Tie = tuple[Float[Tensor, "4 4"], list[Link]]
+"""Sim(3) from the world of a part to that of another, and the links that agree on it."""
 
 
 def common_gauge(parts: Sequence[PartViews], links: Sequence[Link]) -> Gauge:
@@ -56,15 +51,16 @@ def common_gauge(parts: Sequence[PartViews], links: Sequence[Link]) -> Gauge:
     ties = _ties(parts, links)
     group = list(range(len(parts)))
     tree: dict[int, list[tuple[int, Tensor]]] = defaultdict(list)
-    for (a, b), tie in sorted(ties.items(), key=lambda t: (-len(t[1].links), t[0])):
+    for (a, b), (S, _) in sorted(ties.items(), key=lambda t: (-len(t[1][1]), t[0])):
         if group[a] != group[b]:
-            tree[a].append((b, tie.S))
-            tree[b].append((a, sim3_inverse(tie.S)))
+            tree[a].append((b, S))
+            tree[b].append((a, sim3_inverse(S)))
             group = [group[a] if g == group[b] else g for g in group]
     sizes = {g: sum(len(parts[n].T_cw) for n in range(len(parts)) if group[n] == g) for g in group}
     largest = max(sizes, key=lambda g: (sizes[g], -group.index(g)))
     root = group.index(largest)
-    world, left = {root: torch.eye(4, dtype=torch.float64)}, [root]
+    world = {root: torch.eye(4, dtype=torch.float64)}
+    left = [root]
     while left:
         here = left.pop()
         for there, S in tree[here]:
@@ -72,9 +68,12 @@ def common_gauge(parts: Sequence[PartViews], links: Sequence[Link]) -> Gauge:
                 world[there] = S @ world[here]
                 left.append(there)
     kept = [
-        link for (a, b), tie in ties.items() if a in world and b in world for link in tie.links
+        link
+        for (a, b), (_, agreeing) in ties.items()
+        if a in world and b in world
+        for link in agreeing
         if _agrees(parts, link, world[b] @ sim3_inverse(world[a]), 2 * JOIN_TOLERANCE)
-    ]  # fmt: skip
+    ]
     return Gauge(world, tuple(kept))
 
 
@@ -91,7 +90,7 @@ def _ties(parts: Sequence[PartViews], links: Sequence[Link]) -> dict[tuple[int, 
             parties.append((len(agreeing), sum(o.matched for o in agreeing), S, agreeing))
         size, _, S, agreeing = max(parties, key=lambda p: p[:2])
         if size >= AGREEING_LOOPS:
-            ties[pair] = _Tie(S, tuple(agreeing))
+            ties[pair] = (S, agreeing)
     return ties
 
 

@@ -28,14 +28,19 @@ from geogs.version import __version__
 from geogs_fleet.join.adjust import adjusted
 from geogs_fleet.join.gauge import Gauge, common_gauge
 from geogs_fleet.join.joined_disks import joined_disks, kept, merge_disks, move_disks
-from geogs_fleet.join.joined_files import JoinedPart, fingerprint, write_map, write_poses
-from geogs_fleet.join.joined_surface import SpacePlan, coloured, joint_mesh, plan_space
-from geogs_fleet.join.joined_trajectory import spans_of
+from geogs_fleet.join.joined_files import JoinedPart, fingerprint, spans_of, write_map, write_poses
+from geogs_fleet.join.joined_surface import (
+    SpacePlan,
+    coloured,
+    equal_runs,
+    joint_mesh,
+    plan_space,
+    render_views,
+)
 from geogs_fleet.join.links import Link, candidates, links_of
 from geogs_fleet.join.part import Part, PartViews, describe, opened
 from geogs_fleet.join.part_graph import Placement, placed
 from geogs_fleet.join.records import read_record
-from geogs_fleet.join.stored_views import equal_runs, render_views
 from geogs_fleet.workers import Workers
 
 _PAIRS = 24
@@ -59,7 +64,10 @@ class _Join:
     def __init__(
         self, parts: Sequence[Part], output: Path, config: Config, workers: Workers, device: str
     ) -> None:
-        self.parts, self.config, self.workers, self.device = list(parts), config, workers, device
+        self.parts = list(parts)
+        self.config = config
+        self.workers = workers
+        self.device = device
         self.output = output
         self.work = output / "join"
         self.work.mkdir()
@@ -68,13 +76,20 @@ class _Join:
         self.stopwatch = Stopwatch()
 
     def links(self) -> list[Link]:
-        jobs, views = [], (read_record(PartViews, file) for file in self.files)  # one at a time
+        jobs = []  # one at a time
+        views = (read_record(PartViews, file) for file in self.files)
         for (a, b), pairs in candidates(views, self.config.loop).items():
             for start in range(0, len(pairs), _PAIRS):
-                jobs.append((
-                    (a, b), (self.parts[a], self.parts[b]), (self.files[a], self.files[b]),
-                    pairs[start : start + _PAIRS], self.camera, self.config,
-                ))  # fmt: skip
+                jobs.append(
+                    (
+                        (a, b),
+                        (self.parts[a], self.parts[b]),
+                        (self.files[a], self.files[b]),
+                        pairs[start : start + _PAIRS],
+                        self.camera,
+                        self.config,
+                    )
+                )
         return [link for some in self.workers.map("verifying", links_of, jobs) for link in some]
 
     def disks(self, gauge: Gauge, placements: dict[int, Placement]) -> MapSnapshot:
@@ -155,7 +170,8 @@ def _placed_parts(
     join: _Join, adjust: bool, say: Callable[[str], None]
 ) -> tuple[Gauge, dict[int, JoinedPart]]:
     """The connected parts with their poses in the joint world, by their numbers."""
-    parts, config = join.parts, join.config
+    parts = join.parts
+    config = join.config
     with join.stopwatch("describing"):
         files = zip(parts, join.files, strict=True)
         described = [(part, join.camera, file, join.device) for part, file in files]
@@ -176,9 +192,15 @@ def _placed_parts(
     if adjust:
         with join.stopwatch("bundle adjustment"):
             placements = adjusted(
-                parts, join.files, placements, gauge, join.camera, config, join.workers,
+                parts,
+                join.files,
+                placements,
+                gauge,
+                join.camera,
+                config,
+                join.workers,
                 join.work / "adjust",
-            )  # fmt: skip
+            )
     results = {n: opened(parts[n]) for n in gauge.parts}
     spans = spans_of(
         [parts[n].name for n in gauge.parts],
@@ -218,7 +240,8 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     }
     write_text(join.output / "summary.json", json.dumps(summary, indent=2))
     written = load_result(join.output, join.device)
-    report, renders = join.output / "report", written.keyframes
+    report = join.output / "report"
+    renders = written.keyframes
     write_pictures(report, trajectory, renders)
     write_page(report, trajectory, renders, mesh, summary, written.disks)
     return Joint(join.output, tuple(unjoined), summary["verdict"]["sentence"])
@@ -230,9 +253,10 @@ def _statistics(
     """Part of the summary about the parts."""
     verdicts = [result.summary.get("verdict") for result in results]
     unreliable = [
-        result.name for result, verdict in zip(results, verdicts, strict=True)
+        result.name
+        for result, verdict in zip(results, verdicts, strict=True)
         if isinstance(verdict, dict) and verdict.get("is_reliable") is False
-    ]  # fmt: skip
+    ]
     whole = len(results) + len(unjoined)
     sentence = f"{len(results)} of {whole} parts are one place, by {len(gauge.links)} links."
     if unjoined:

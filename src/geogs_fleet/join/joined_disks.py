@@ -12,7 +12,7 @@ from geogs.geometry.lie import quaternion_to_matrix, se3_inverse
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.io.writers.map_file import load_map_file, save_map
-from geogs.mapping.similarity_field import CovisibleKeyframe, blended_similarities
+from geogs.mapping.map_update import CovisibleKeyframe, blended_similarities
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot
 from geogs.world.disks import DiskParameters, GaussianMap
@@ -36,9 +36,10 @@ def move_disks(
 ) -> None:
     """Move every disk of a part with the keyframes that see it; write the file ``after``.
 
-    This is the update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
+    This is the update of a map after a correction, see :mod:`geogs.mapping.map_update`.
     """
-    result, views = opened(part, device), read_record(PartViews, views_file)
+    result = opened(part, device)
+    views = read_record(PartViews, views_file)
     similarities = placement.similarities(views.T_cw)
     x = result.disks.position.double()
     whole = overall(views, similarities).to(x)
@@ -65,7 +66,8 @@ def overall(views: PartViews, similarities: Float[Tensor, "n 4 4"]) -> Float[Ten
     moved = points @ similarities[:, :3, :3].mT + similarities[:, None, :3, 3]
     scale, R, t = umeyama(points.flatten(0, 1), moved.flatten(0, 1))
     S = torch.eye(4, dtype=torch.float64)
-    S[:3, :3], S[:3, 3] = scale * R, t
+    S[:3, :3] = scale * R
+    S[:3, 3] = t
     return S
 
 
@@ -95,8 +97,9 @@ def is_covered(disks: MapSnapshot, others: MapSnapshot) -> Bool[Tensor, "n"]:
     covered = torch.zeros(len(disks), dtype=torch.bool)
     if not len(disks) or not len(others):
         return covered
-    x, y = disks.position.double(), others.position.double()
-    axes = _axes(others)
+    x = disks.position.double()
+    y = others.position.double()
+    axes = quaternion_to_matrix(others.quaternion.double())  # tangents and normal, as columns
     own_normal = disks.normal.double()
     _, index = nearest_neighbors(x, y, min(_NEAREST, len(others)))
     for k in range(index.shape[1]):
@@ -108,11 +111,6 @@ def is_covered(disks: MapSnapshot, others: MapSnapshot) -> Bool[Tensor, "n"]:
         alike = (own_normal * axes[at, :, 2]).sum(1) > _ALIKE
         covered |= inside & near & alike
     return covered
-
-
-def _axes(disks: MapSnapshot) -> Float[Tensor, "n 3 3"]:
-    """Tangents and normal of each disk, as columns."""
-    return quaternion_to_matrix(disks.quaternion.double())
 
 
 def joined_disks(disks: Sequence[MapSnapshot]) -> MapSnapshot:

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
 
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.documents import read_bytes
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_inverse
-from geogs.io.sources.frame_source import RecordingSpan
+from geogs.geometry.lie import se3_inverse, sim3_scale, so3_exp, so3_log
+from geogs.io.sources.frame_source import PAUSE, RecordingSpan
 from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.keyframe_folder import image_path, rows_path, write_image, write_rows
@@ -23,9 +25,56 @@ from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mapping.map_frame import WORLD
 from geogs.types import MapSnapshot, SeenRows, Trajectory
-from geogs_fleet.join.joined_trajectory import joined_trajectory, moved_trajectory
 from geogs_fleet.join.part import PartViews, image_of
 from geogs_fleet.join.part_graph import Placement
+
+
+def spans_of(names: list[str], times: list[Float64[np.ndarray, "n"]]) -> list[RecordingSpan]:
+    """Spans of the parts one after the other, like those of several videos in ``geogs run``."""
+    spans: list[RecordingSpan] = []
+    frames = 0
+    end = 0.0
+    for name, own in zip(names, times, strict=True):
+        first = end + PAUSE if spans else float(own[0])
+        spans.append(RecordingSpan(name, frames, first, float(own[0])))
+        frames = frames + len(own)
+        end = float(own[-1]) + first - float(own[0])
+    return spans
+
+
+def moved_trajectory(trajectory: Trajectory, views: PartViews, placement: Placement) -> Trajectory:
+    """Poses of a part's frames in the joint world, interpolated in time between keyframes."""
+    S = placement.similarities(views.T_cw)
+    times = views.timestamp
+    at = trajectory.timestamps.clip(times[0], times[-1])
+    after = np.searchsorted(times, at).clip(min(1, len(times) - 1), len(times) - 1)
+    before = (after - 1).clip(min=0)
+    length = np.maximum(times[after] - times[before], 1e-12)
+    fraction = torch.from_numpy(((at - times[before]) / length).clip(0, 1))
+    T_wc = torch.from_numpy(trajectory.T_wc)
+    first, second = (_moved(S[torch.from_numpy(n)], T_wc) for n in (before, after))
+    moved = first.clone()
+    rotation = so3_log(second[:, :3, :3] @ first[:, :3, :3].mT)
+    moved[:, :3, :3] = so3_exp(fraction[:, None] * rotation) @ first[:, :3, :3]
+    moved[:, :3, 3] += fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    return Trajectory(trajectory.timestamps, moved.numpy(), trajectory.tracked, trajectory.oriented)
+
+
+def _moved(S: Float[Tensor, "n 4 4"], T_wc: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """Camera-to-world poses by world similarities."""
+    moved = S @ T_wc
+    moved[:, :3, :3] /= sim3_scale(S)[:, None, None]
+    return moved
+
+
+def joined_trajectory(parts: list[Trajectory], spans: list[RecordingSpan]) -> Trajectory:
+    """The trajectories one after the other, in the joint time."""
+    times = [t.timestamps + span.shift for t, span in zip(parts, spans, strict=True)]
+    return Trajectory(
+        np.concatenate(times),
+        np.concatenate([t.T_wc for t in parts]),
+        np.concatenate([t.tracked for t in parts]),
+    )
 
 
 @dataclass(frozen=True)
@@ -37,19 +86,14 @@ class JoinedPart:
     placement: Placement
     span: RecordingSpan
 
-    @property
-    def trajectory(self) -> Trajectory:
-        """Poses of its frames, in the joint world and its own time."""
-        return moved_trajectory(self.result.trajectory, self.views, self.placement)
-
 
 def write_poses(output: Path, parts: Sequence[JoinedPart]) -> Trajectory:
     """Write ``trajectory.tum``, ``keyframes.tum`` and the table of the frames' uncertainty.
 
     Returns the trajectory. Raises OutputError if a file cannot be written.
     """
-    spans = [part.span for part in parts]
-    trajectory = joined_trajectory([part.trajectory for part in parts], spans)
+    moved = [moved_trajectory(p.result.trajectory, p.views, p.placement) for p in parts]
+    trajectory = joined_trajectory(moved, [part.span for part in parts])
     keyframes = Trajectory(
         _times(parts),
         np.concatenate([se3_inverse(part.placement.T_cw).numpy() for part in parts]),
@@ -72,7 +116,8 @@ def write_map(
         OutputError: a file cannot be written.
     """
     first = parts[0].result.views
-    count, rows = 0, dict[int, SeenRows]()
+    count = 0
+    rows = dict[int, SeenRows]()
     for part in parts:
         own = part.result.rows() if part.result.camera == camera else {}
         for n, id in enumerate(part.result.views.keyframe_id.tolist()):

@@ -105,13 +105,23 @@ def links_of(
         if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
             continue
         loop = Loop(
-            first.id, second.id, "appearance", check.T_ji, check.scale, inliers, check.matched,
-            check.there, check.back,
-        )  # fmt: skip
-        relative = _between(of_loop(store, loop), first.id)
+            first.id,
+            second.id,
+            "appearance",
+            check.T_ji,
+            check.scale,
+            inliers,
+            check.matched,
+            check.there,
+            check.back,
+        )
+        relative = of_loop(store, loop)
+        source = (relative.source != first.id).long()
+        target = (relative.target != first.id).long()
         if len(relative):
             nodes = (numbers[0], a), (numbers[1], b)
-            found.append(Link(*nodes, loop.S_ji.cpu(), check.matched, relative))
+            ends = replace(relative, source=source, target=target)
+            found.append(Link(*nodes, loop.S_ji.cpu(), check.matched, ends))
     return found
 
 
@@ -146,12 +156,6 @@ def _seen(grid: SampleGrid, views: PartViews, n: int) -> FeatureView:
         torch.from_numpy(x[n]) for x in (views.inverse_depth, views.information)
     )
     return FeatureView.of(grid, inverse, information, views.features[n])
-
-
-def _between(relative: RelativePoses, first: int) -> RelativePoses:
-    """Replace two ids by 0 and 1."""
-    source, target = ((end != first).long() for end in (relative.source, relative.target))
-    return replace(relative, source=source, target=target)
 
 
 def _thinned(scored: list[tuple[float, int, int]], reach: int) -> list[tuple[int, int]]:

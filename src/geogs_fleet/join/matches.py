@@ -48,7 +48,8 @@ class Depths:
 
     def give(self, keyframe: Keyframe, place: int) -> None:
         """Give a keyframe its depths, by its index in the part."""
-        keyframe.inverse_depth, keyframe.information = self.inverse[place], self.information[place]
+        keyframe.inverse_depth = self.inverse[place]
+        keyframe.information = self.information[place]
         keyframe.moving = self.moving[place]
 
 
@@ -75,8 +76,10 @@ class Member:
         """Current depths."""
         if self.adjusted is not None:
             return read_record(Depths, self.adjusted)
-        views, scale = read_record(PartViews, self.views), self.scale.float()[:, None]
-        inverse, known = torch.from_numpy(views.inverse_depth), torch.from_numpy(views.information)
+        views = read_record(PartViews, self.views)
+        scale = self.scale.float()[:, None]
+        inverse = torch.from_numpy(views.inverse_depth)
+        known = torch.from_numpy(views.information)
         return Depths(inverse * scale, known / scale.square(), torch.zeros_like(known).bool())
 
 
@@ -104,11 +107,17 @@ class Matches:
         """Pack edges in order, with the shift of each if there are any."""
         flows = [edges[pair] for pair in sorted(edges)]
         if not flows:
-            empty, pixels = np.zeros((0, cells), np.float32), np.zeros((0, cells, 2))
+            empty = np.zeros((0, cells), np.float32)
+            pixels = np.zeros((0, cells, 2))
             return Matches(
-                np.zeros((0, 4), np.int64), pixels.astype(np.int16), pixels.astype(np.float16),
-                np.zeros((0, 2, 4, 4)), empty, empty, pixels.astype(np.int16),
-            )  # fmt: skip
+                np.zeros((0, 4), np.int64),
+                pixels.astype(np.int16),
+                pixels.astype(np.float16),
+                np.zeros((0, 2, 4, 4)),
+                empty,
+                empty,
+                pixels.astype(np.int16),
+            )
         shifts = [shift[pair].numpy() for pair in sorted(edges)] if shift else []
         damping = [f.damping for f in flows if f.damping is not None]
         return Matches(
@@ -165,7 +174,8 @@ def match(
         before: files of earlier matches; only pairs that have moved since are matched again.
         after: files to write: edges that leave its own keyframes, then those of each other part.
     """
-    grid, members = SampleGrid(camera), (own, *others)
+    grid = SampleGrid(camera)
+    members = (own, *others)
     operator = build_operator(config.tracking, grid)
     segment = KeyframeTable.on(grid, operator.encode).new_set()
     known: dict[Directed, PackedEdge] = {}
@@ -176,7 +186,8 @@ def match(
     results = {member.number: opened(member.part) for member in members}
     for member in members:
         places = [k for n, k in member.nodes if member is own or (n, k) in seen]
-        views, depths = read_record(PartViews, member.views), member.depths()
+        views = read_record(PartViews, member.views)
+        depths = member.depths()
         result = results[member.number]
         loaded = loaded_keyframes(segment, operator, result, views, places, member.T_cw)
         for place, keyframe in loaded.items():
@@ -244,9 +255,12 @@ def _row_errors(
 
 def _pairs(graph: FrameGraph, own: int) -> list[Pair]:
     """Pairs within a part, and with others, whose keyframes come after its own."""
-    segment, camera = graph.keyframes, graph.keyframes.grid.camera
-    first, others = segment.ids[:own], segment.ids[own:]
-    limit, count = MAX_DISTANCE * max(camera.width, camera.height), PAIRS * own
+    segment = graph.keyframes
+    camera = graph.keyframes.grid.camera
+    first = segment.ids[:own]
+    others = segment.ids[own:]
+    limit = MAX_DISTANCE * max(camera.width, camera.height)
+    count = PAIRS * own
     found = proximity_pairs(segment, first, first, [], RADIUS, SUPPRESSION, limit, count)
     if others:
         found += proximity_pairs(segment, others, first, [], 0, SUPPRESSION, limit, count)
@@ -255,7 +269,8 @@ def _pairs(graph: FrameGraph, own: int) -> list[Pair]:
 
 def _near(own: Member, others: Sequence[Member]) -> set[Node]:
     """Keyframes of others whose distance to one of its own is less than their median depth."""
-    around, near = _centres(own), set[Node]()
+    around = _centres(own)
+    near = set[Node]()
     for other in others:
         depth = read_record(PartViews, other.views).median_depth / other.scale.numpy()
         away = np.linalg.norm(_centres(other)[:, None] - around, axis=2).min(axis=1)

@@ -68,16 +68,21 @@ def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int
     """
     result = opened(part, device)
     grid = SampleGrid(camera)
-    depths, known, features = [], [], []
+    depths = []
+    known = []
+    features = []
     for number, T_cw in enumerate(torch.from_numpy(result.views.T_cw)):
         features.append(orb_features(image_of(result, number, camera)))
         inverse, information = _on_grid(result, T_cw, grid)
         depths.append(inverse)
         known.append(information)
     views = PartViews(
-        result.views.T_cw, result.views.timestamp, np.stack(depths), np.stack(known),
+        result.views.T_cw,
+        result.views.timestamp,
+        np.stack(depths),
+        np.stack(known),
         tuple(features),
-    )  # fmt: skip
+    )
     write_record(file, views)
     return len(depths)
 

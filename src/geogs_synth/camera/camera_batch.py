@@ -10,8 +10,6 @@ from geogs_synth.draw import rotated
 
 MIN_Z = 0.01
 """Least depth in metres of points that have a projection."""
-ROUNDS = 8
-"""Projections that find the row that sees a point; each leaves a tenth of the error."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,8 @@ def rays(
     d = torch.stack(torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), -1)
     centre = views.centre[:, view, None]
     if views.sweep is not None:
-        fraction, (rotation, translation) = views.row_fraction(y), views.swept(view)
+        fraction = views.row_fraction(y)
+        (rotation, translation) = views.swept(view)
         d = rotated(d, fraction * rotation)
         centre = centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], fraction * translation)
     direction = torch.einsum("bij,bmj->bmi", views.R_wc[:, view], d)
@@ -96,7 +95,7 @@ def project(
     pixels, before = _pinhole(views, middle)
     if views.sweep is not None:
         rotation, translation = views.swept(view)
-        for _ in range(ROUNDS):
+        for _ in range(8):  # each leaves a tenth of the error
             fraction = views.row_fraction(pixels[..., 1])
             in_row = rotated(middle - fraction * translation, -fraction * rotation)
             pixels, before = _pinhole(views, in_row)

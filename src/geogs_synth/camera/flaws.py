@@ -14,28 +14,28 @@ class Flaws(Settings, group="flaws"):
     """The flaws of a camera."""
 
     readout: Annotated[float, Range(0, 0.1)] = 0.0
-    """Seconds from the first to the last row of a rolling shutter; 0 takes all rows at once."""
+    """Readout of the rolling shutter from first row to last, seconds; 0 is a global shutter."""
     exposure: Annotated[float, Range(0, 0.1)] = 0.0
-    """Seconds over which each row gathers light, which blurs what moves."""
+    """Exposure time of each row, seconds; it blurs what moves."""
     noise: Annotated[float, Range(0, 50)] = 0.0
-    """Standard deviation of the sensor's noise in grey levels of 255."""
+    """Standard deviation of the sensor's noise, in 8-bit grey levels."""
     gain_drift: Annotated[float, Range(0, 3)] = 0.0
-    """Stops by which the automatic exposure wanders to either side, within a few seconds."""
+    """Amplitude of the drift of the automatic exposure over a few seconds, stops."""
     colour_drift: Annotated[float, Range(0, 0.5)] = 0.0
-    """Fraction by which the white balance wanders between red and blue."""
+    """Amplitude of the drift of the white balance between red and blue, a fraction of the gain."""
     vignetting: Fraction = 0.0
-    """Fraction of the light that is lost in the corners."""
+    """Fraction of the light lost in the corners."""
     jpeg: Annotated[int, Range(1, 100)] | None = None
-    """Quality of JPEG that the image goes through; none writes it as the format does."""
+    """JPEG quality at which the camera compresses; none leaves that to the image format."""
     k1: Annotated[float, Range(-0.5, 0.5)] = 0.0
-    """Radial distortion, OpenCV's first coefficient; it is written with the intrinsics."""
+    """First coefficient of OpenCV's radial distortion, written with the intrinsics."""
     k2: Annotated[float, Range(-0.5, 0.5)] = 0.0
-    """Radial distortion, OpenCV's second coefficient."""
+    """Second coefficient of OpenCV's radial distortion, written with the intrinsics."""
     focusing: Annotated[float, Range(0, 0.2)] = 0.0
-    """Part by which the focal length changes to either side, within a second or two, as the camera
-    focuses; the intrinsics are those in the middle."""
+    """Amplitude of the change of the focal length by focusing, a fraction of it, within a second or
+    two; the intrinsics written are the mean."""
     stabilisation: Annotated[float, Range(0, 0.1)] = 0.0
-    """Focal lengths by which the principal point is moved to either side against a hand's shake."""
+    """Amplitude of the principal point's motion by optical stabilisation, in focal lengths."""
 
 
 _TYPICAL: dict[CameraKind, Flaws] = {

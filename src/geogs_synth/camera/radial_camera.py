@@ -1,6 +1,6 @@
-"""A pinhole camera with or without radial distortion, and the rays through its pixels."""
+"""A pinhole camera with or without radial distortion, and a lens that changes over time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -8,8 +8,12 @@ from jaxtyping import Float64, Int64
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs_synth.camera.flaws import Flaws
 
-_ITERATIONS = 60
+_FOCUS_PERIODS = np.array([1.1, 2.3, 4.7])
+"""Periods of the waves of the focus, seconds."""
+_SHAKE_PERIODS = np.array([0.17, 0.31, 0.7])
+"""Periods of a hand's shake, which the stabilisation counteracts, seconds."""
 
 
 @dataclass(frozen=True)
@@ -78,17 +82,22 @@ class RadialCamera:
         if self.is_distorted:
             left, right = _indices(self.rays[0], low[..., 0], high[..., 0], axis=0)
             top, bottom = _indices(self.rays[1], low[..., 1], high[..., 1], axis=1)
-            first, last = np.stack([left, top], -1), np.stack([right, bottom], -1)
+            first = np.stack([left, top], -1)
+            last = np.stack([right, bottom], -1)
         else:
-            focal, centre = np.array([c.fx, c.fy]), np.array([c.cx, c.cy])
-            first, last = np.ceil(focal * low + centre), np.floor(focal * high + centre + 1)
-        first, last = np.clip(first - margin, 0, size), np.clip(last + margin, 0, size)
+            focal = np.array([c.fx, c.fy])
+            centre = np.array([c.cx, c.cy])
+            first = np.ceil(focal * low + centre)
+            last = np.floor(focal * high + centre + 1)
+        first = np.clip(first - margin, 0, size)
+        last = np.clip(last + margin, 0, size)
         return np.concatenate([first, last], -1).astype(np.int64)
 
     @property
     def view(self) -> tuple[float, float, float, float]:
         """Left, top, right and bottom end of the view on the plane z = 1, a pixel wider."""
-        c, (x, y) = self.camera, self.rays
+        c = self.camera
+        (x, y) = self.rays
         if self.is_distorted:
             dx, dy = 2 / c.fx, 2 / c.fy
             return x.min() - dx, y.min() - dy, x.max() + dx, y.max() + dy
@@ -119,7 +128,7 @@ class RadialCamera:
         end = grid[folds[0] - 1] if len(folds) else grid[-1]
         low, high = np.zeros_like(bent), np.full_like(bent, end)
         beyond = bent > self._bend(np.full_like(bent, end))
-        for _ in range(_ITERATIONS):
+        for _ in range(60):
             middle = (low + high) / 2
             inside = self._bend(middle) < bent
             low, high = np.where(inside, middle, low), np.where(inside, high, middle)
@@ -138,3 +147,72 @@ def _indices(
         np.searchsorted(values.max(axis), low, side="left"),
         np.searchsorted(values.min(axis), high, side="right"),
     )
+
+
+class MovingLens:
+    """A lens whose focal length changes by focusing, its principal point by stabilisation."""
+
+    def __init__(self, lens: RadialCamera, flaws: Flaws, seed: int = 0) -> None:
+        self._lens = lens
+        self._flaws = flaws
+        self._phases = np.random.default_rng([seed, 0x1E5]).uniform(0, 2 * np.pi, (3, 3))
+
+    @property
+    def is_still(self) -> bool:
+        """Whether its intrinsics are constant."""
+        return self._flaws.focusing == 0 and self._flaws.stabilisation == 0
+
+    def in_rows(self, times: Float64[np.ndarray, "h"]) -> RadialCamera:
+        """The lens of an image whose rows are taken at these seconds."""
+        if self.is_still:
+            return self._lens
+        lens = self.at(float(times[len(times) // 2]))
+        return _LensInRows(lens.camera, lens.k1, lens.k2, rows=self._intrinsics(times))
+
+    def at(self, time: float) -> RadialCamera:
+        """The lens at ``time`` seconds."""
+        if self.is_still:
+            return self._lens
+        fx, fy, cx, cy = self._intrinsics(np.array([time]))[0].tolist()
+        return replace(self._lens, camera=replace(self._lens.camera, fx=fx, fy=fy, cx=cx, cy=cy))
+
+    def _intrinsics(self, times: Float64[np.ndarray, "t"]) -> Float64[np.ndarray, "t 4"]:
+        """fx, fy, cx and cy at times in seconds."""
+        flaws = self._flaws
+        camera = self._lens.camera
+        focus = _wave(times, _FOCUS_PERIODS, self._phases[0])
+        right, down = (_wave(times, _SHAKE_PERIODS, phase) for phase in self._phases[1:])
+        factor = 1 + flaws.focusing * focus
+        fx, fy = factor * camera.fx, factor * camera.fy
+        cx = camera.cx + flaws.stabilisation * right * fx
+        cy = camera.cy + flaws.stabilisation * down * fy
+        return np.stack([fx, fy, cx, cy], 1)
+
+
+@dataclass(frozen=True)
+class _LensInRows(RadialCamera):
+    """A lens that changes while an image is read."""
+
+    rows: Float64[np.ndarray, "h 4"] = field(kw_only=True)
+    """fx, fy, cx and cy at the time of each row."""
+
+    @property
+    def is_distorted(self) -> bool:
+        """True: straight lines look bent where the lens moves."""
+        return True
+
+    @property
+    def _planes(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
+        fx, fy, cx, cy = self.rows.T[..., None]
+        v, u = np.mgrid[: self.camera.height, : self.camera.width]
+        return (u - cx) / fx, (v - cy) / fy
+
+
+def _wave(
+    times: Float64[np.ndarray, "t"],
+    periods: Float64[np.ndarray, "k"],
+    phases: Float64[np.ndarray, "k"],
+) -> Float64[np.ndarray, "t"]:
+    """Mean of the sines, between -1 and 1."""
+    waves: Float64[np.ndarray, "t"] = np.sin(2 * np.pi * times[:, None] / periods + phases).mean(1)
+    return waves

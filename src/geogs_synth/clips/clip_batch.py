@@ -34,7 +34,8 @@ class ClipBatch:
 
     def flow(self, first: int, second: int) -> FlowTruth:
         """Pixels in the view ``second`` of the points that the view ``first`` sees."""
-        points, solids = self.points(first), self.solids
+        points = self.points(first)
+        solids = self.solids
         if self.dynamics is not None:
             points = points + (second - first) * self.dynamics.velocity_of(self.solid[:, first])
             solids = solids.moved_by(self.dynamics.velocity, second)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs_synth.clips import loose, pieces, thin_things
+from geogs_synth.clips import pieces
 from geogs_synth.clips.pieces import BOARDS, StandingPiece
 from geogs_synth.draw import Draw, about_z
 from geogs_synth.scene.solids import NONE, SolidBatch, Solids
@@ -48,7 +48,7 @@ def draw_furnishing(
     shelves = pieces.shelves(draw, size, 2)
     furniture = (cupboards, tables, shelves)
     standing = [_drawn(draw, placed, density) for placed in furniture]
-    floor = loose.floor(size)
+    floor = pieces.floor(size)
     supports = [(cupboards, standing[0], 0), (tables, standing[1], 0)]
     supports += [(shelves, standing[2], k) for k in range(BOARDS)]
     # Things that would stand on a missing piece stand on the floor.
@@ -72,10 +72,10 @@ def draw_furnishing(
         _Group(_put(pieces.skirting(draw, size), draw.chance(0.6, b, 1)), 4),
         _Group(some(pieces.lamps(draw, size, 2)), 1),
         _Group(some(pieces.plants(draw, size, 1)), 8),
-        _Group(some(loose.books(draw, faces, 3)), 1),
-        _Group(scattered(loose.clutter(draw, anywhere, 20), 1.2), 1),
-        _Group(scattered(loose.wires(draw, size, 5)), 1),
-        _Group(scattered(loose.slabs(draw, size, 4), 0.6), 1),
+        _Group(some(pieces.books(draw, faces, 3)), 1),
+        _Group(scattered(pieces.clutter(draw, anywhere, 20), 1.2), 1),
+        _Group(scattered(pieces.wires(draw, size, 5)), 1),
+        _Group(scattered(pieces.slabs(draw, size, 4), 0.6), 1),
     ]
     return _join(*groups, *(_thin_things(draw, size, thin) if thin > 0 else ()))
 
@@ -84,14 +84,14 @@ def _thin_things(draw: Draw, size: Float[Tensor, "b 3"], most: float) -> tuple[_
     """Railings, lattices, cables, bushes and more chairs: none in some rooms, many in others."""
     density = draw.uniform(0, most, len(size))[:, None]
     some = partial(_some, draw, density)
-    cables = thin_things.cables(draw, size, 3)
+    cables = pieces.cables(draw, size, 3)
     gone = draw.uniform(0, 1, len(size), 3) > density
-    cables = cables.without(gone.repeat_interleave(thin_things.SEGMENTS, 1))
+    cables = cables.without(gone.repeat_interleave(pieces.SEGMENTS, 1))
     return (
-        _Group(some(thin_things.railings(draw, size, 2)), thin_things.BALUSTERS + 2),
-        _Group(some(thin_things.lattices(draw, size, 2)), 2 * thin_things.BARS),
-        _Group(cables, thin_things.SEGMENTS),
-        _Group(some(thin_things.bushes(draw, size, 2)), thin_things.TWIGS),
+        _Group(some(pieces.railings(draw, size, 2)), pieces.BALUSTERS + 2),
+        _Group(some(pieces.lattices(draw, size, 2)), 2 * pieces.BARS),
+        _Group(cables, pieces.SEGMENTS),
+        _Group(some(pieces.bushes(draw, size, 2)), pieces.TWIGS),
         _Group(some(pieces.chairs(draw, size, 3)), 6),
         _Group(some(pieces.tables(draw, size, 1)), 5),
     )
@@ -120,7 +120,8 @@ def _join(*groups: _Group) -> Furnishing:
     material: list[int] = []
     picture: list[bool] = []
     for group in groups:
-        start, count = len(material), group.solids.kind.shape[1]
+        start = len(material)
+        count = group.solids.kind.shape[1]
         material += [start + k - k % group.per_material for k in range(count)]
         picture += [group.picture > 0 and k % group.picture == 0 for k in range(count)]
     solids = Solids.join([g.solids for g in groups])

@@ -13,12 +13,8 @@ from geogs_synth.scene.rooms import Surfaces
 
 _PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
 """Fraction of each wall, the floor and the ceiling that has next to no texture."""
-_PLAIN_SOLID = 0.35
 _SHOWS_IMAGE = (0.12, 0.12, 0.12, 0.12, 0.12, 0.04)
 """Fraction of them that show images rather than materials."""
-_SOLID_SHOWS_IMAGE = 0.35
-_PERIOD = (0.06, 0.7)
-"""Width in metres of a pattern that walls repeat."""
 
 
 def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int) -> Surfaces:
@@ -33,8 +29,8 @@ def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int)
     polished = (draw.chance(0.15, b) * draw.log_uniform(0.03, 0.5, b))[:, None]
     walls = replace(walls, mirror=torch.tensor([0.0] * 4 + [1.0, 0.0]) * polished)
 
-    plain = draw.chance(_PLAIN_SOLID, b, 2 * n)
-    image = draw.chance(_SOLID_SHOWS_IMAGE, b, 2 * n)
+    plain = draw.chance(0.35, b, 2 * n)
+    image = draw.chance(0.35, b, 2 * n)
     texture = _texture(draw, image, textures, materials)
     solids = _draw(draw, plain, texture, textures, (0.08, 5.0))
     pictures = _texture(draw, torch.ones_like(image), textures, materials)
@@ -128,7 +124,7 @@ def papered(draw: Draw, surfaces: Surfaces, which: Bool[Tensor, "b"]) -> Surface
     chosen = half | (floor & (which & draw.chance(0.5, b))[:, None])
     chosen = torch.nn.functional.pad(chosen, (0, surfaces.contrast.shape[1] - 6))
     scale = surfaces.matrix[..., 0].norm(dim=-1)
-    wanted = 1 / draw.log_uniform(*_PERIOD, b, 1)
+    wanted = 1 / draw.log_uniform(0.06, 0.7, b, 1)  # repeats per metre
     matrix = surfaces.matrix * (wanted / scale)[..., None, None]
     contrast = draw.log_uniform(0.15, 1.2, b, 1).expand_as(scale)
     return replace(

@@ -51,7 +51,8 @@ def choose_cameras(
     rank = torch.where(good, 200.0 + 100.0 * sight.crowd, clear.clamp(-10, 10))
     best = torch.where(crowded, 1000.0 - order, rank).argmax(1)
     rows = torch.arange(len(size), device=size.device)
-    R_cw, centre = paths.R_wc[rows, best].transpose(-1, -2), paths.centre[rows, best]
+    R_cw = paths.R_wc[rows, best].transpose(-1, -2)
+    centre = paths.centre[rows, best]
     T_cw = torch.eye(4, device=size.device).repeat(*R_cw.shape[:2], 1, 1)
     T_cw[..., :3, :3] = R_cw
     T_cw[..., :3, 3] = -(R_cw @ centre[..., None])[..., 0]

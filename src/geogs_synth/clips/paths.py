@@ -25,45 +25,11 @@ class Paths:
     """Fraction of the image that solids should fill."""
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """Ranges that a kind of motion is drawn from."""
-
-    length: tuple[float, float]
-    """Metres between two views."""
-    rotation: float
-    """Largest rotation about each axis, degrees."""
-    hold: tuple[float, float]
-    """Fraction of the rotation that keeps the same point in view."""
-    along_axis: float = 0.0
-    """0 moves in any direction, 1 along the optical axis."""
-
-
-_KINDS = (
-    _Motion((0.02, 0.15), 4.0, (0.0, 1.0)),
-    _Motion((0.15, 0.5), 6.0, (0.2, 1.0)),
-    _Motion((0.5, 1.2), 8.0, (0.7, 1.1)),
-    _Motion((1e-4, 2e-4), 20.0, (0.0, 0.0)),
-    _Motion((0.1, 0.8), 4.0, (0.0, 1.0), along_axis=1.0),
-)
-"""Ranges of each kind, in the order of :class:`MotionWeights`."""
-
-
-@dataclass(frozen=True)
-class _PathSteps:
-    """Motion of each of k candidates away from its first pose."""
-
-    translation: Float[Tensor, "b k 3"]
-    """Metres, world frame."""
-    rotation: Float[Tensor, "b k 3"]
-    """Rotation vector, camera frame."""
-    hold: Float[Tensor, "b k"]
-    """Fraction of the rotation that keeps the same point in view."""
-
-
 def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> Paths:
     """Candidates anywhere in the rooms, without regard to the solids there."""
-    b, k, v = len(size), options.candidates, options.views
+    b = len(size)
+    k = options.candidates
+    v = options.views
     start = draw.uniform(0, 1, b, k, 3) * (size - 0.4)[:, None] + 0.2
     start[..., 2] = torch.minimum(draw.uniform(0.4, 2.0, b, k), size[:, 2:] - 0.2)
     target = draw.uniform(0, 1, b, k, 3) * size[:, None]
@@ -71,20 +37,20 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     forward = torch.nn.functional.normalize(target - start, dim=-1)
     roll = torch.where(draw.chance(0.1, b, k), draw.normal(0.5, b, k), draw.normal(0.06, b, k))
     R0 = looking(forward) @ rotation_matrix(torch.nn.functional.pad(roll[..., None], (2, 0)))
-    move = _draw_steps(draw, options.motions, forward)
+    translation, rotation, hold = _draw_steps(draw, options.motions, forward)
 
     # Longer clips go further, but each of their steps is shorter.
     progress = torch.arange(v) / max(math.sqrt(v - 1), 1.0)
     shaken = (v > 2) * (progress[:, None] > 0)
     steps = progress[:, None] + draw.normal(0.12, b, k, v, 1) * shaken
-    centre = start[:, :, None] + steps * move.translation[:, :, None]
+    centre = start[:, :, None] + steps * translation[:, :, None]
     if options.sway:
         aside = draw.normal(options.sway, b, k, v, 3) * shaken
-        centre = centre + aside * move.translation.norm(dim=-1)[:, :, None, None]
+        centre = centre + aside * translation.norm(dim=-1)[:, :, None, None]
     seen = start + forward * draw.log_uniform(0.8, 4.0, b, k)[..., None]
     jitter = draw.normal(0.1, b, k, v, 3) * shaken
-    R = R0[:, :, None] @ rotation_matrix((steps + jitter) * move.rotation[:, :, None])
-    R = _keep_in_view(R, centre, seen, start, move.hold)
+    R = R0[:, :, None] @ rotation_matrix((steps + jitter) * rotation[:, :, None])
+    R = _keep_in_view(R, centre, seen, start, hold)
     return Paths(R, centre, draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
 
 
@@ -98,12 +64,29 @@ def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tenso
     return torch.stack([fx, fy, cx, cy], -1)
 
 
-def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _PathSteps:
-    """Draw steps; all candidates of a room have one kind of motion, or some would be rarer."""
+def _draw_steps(
+    draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]
+) -> tuple[Float[Tensor, "b k 3"], Float[Tensor, "b k 3"], Float[Tensor, "b k"]]:
+    """Motion of each candidate away from its first pose.
+
+    Translation (metres, world frame), rotation vector (camera frame), and the fraction of the
+    rotation that keeps the same point in view. All candidates of a room have one kind of motion,
+    or some would be rarer.
+    """
     b, k = forward.shape[:2]
     kind = draw.choose(astuple(weights), b)
-    rows = [[*m.length, m.rotation, *m.hold, m.along_axis] for m in _KINDS]
-    numbers = torch.tensor(rows)[kind][:, None].expand(b, k, 6)
+    # Rows in the order of the weights: least and largest metres from view to view, largest degrees
+    # about each axis, least and largest fraction of the rotation, 1 to move along the optical axis.
+    kinds = torch.tensor(
+        [
+            [0.02, 0.15, 4.0, 0.0, 1.0, 0.0],
+            [0.15, 0.5, 6.0, 0.2, 1.0, 0.0],
+            [0.5, 1.2, 8.0, 0.7, 1.1, 0.0],
+            [1e-4, 2e-4, 20.0, 0.0, 0.0, 0.0],
+            [0.1, 0.8, 4.0, 0.0, 1.0, 1.0],
+        ]
+    )
+    numbers = kinds[kind][:, None].expand(b, k, 6)
     low, high, degrees, hold_low, hold_high, along = numbers.unbind(-1)
     length = low * (high / low) ** draw.uniform(0, 1, b, k)
     sign = (1 - 2 * draw.integers(2, b, k))[..., None]
@@ -113,7 +96,7 @@ def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 
     rotation = draw.uniform(-1, 1, b, k, 3) * torch.tensor([1.0, 1.0, 0.5])
     rotation = rotation * (degrees * math.pi / 180)[..., None]
     hold = hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k)
-    return _PathSteps(translation, rotation, hold)
+    return translation, rotation, hold
 
 
 def _keep_in_view(

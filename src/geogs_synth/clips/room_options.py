@@ -8,36 +8,36 @@ from geogs.config.setting import Count, Fraction, Range, Settings, Weight
 
 @dataclass(frozen=True)
 class MotionWeights(Settings, group="training.rooms.motions"):
-    """Relative frequency of the kinds of camera motion."""
+    """Relative frequencies of the kinds of camera motion from view to view."""
 
     hand_held: Weight = 0.25
-    """2 to 15 cm and a few degrees."""
+    """Frequency of motions by 2 to 15 cm and a few degrees."""
     medium: Weight = 0.30
-    """15 to 50 cm."""
+    """Frequency of motions by 15 to 50 cm."""
     wide: Weight = 0.20
-    """50 cm to 1.2 m, turning so that roughly the same point stays in view."""
+    """Frequency of motions by 50 cm to 1.2 m that rotate to keep a point in view."""
     rotation: Weight = 0.10
-    """Up to 25 degrees about the camera's centre."""
+    """Frequency of rotations by up to 20 degrees about each axis, without translation."""
     forward: Weight = 0.15
-    """10 to 80 cm along the optical axis, either way."""
+    """Frequency of motions by 10 to 80 cm forwards or backwards."""
 
 
 @dataclass(frozen=True)
 class SceneWeights(Settings, group="training.rooms.scenes"):
-    """Relative frequency of the kinds of scenes."""
+    """Relative frequencies of the kinds of scenes."""
 
     usual: Weight = 1.0
-    """A still room, seen by a camera whose shutter opens for a moment."""
+    """Frequency of static rooms, seen with a short exposure and a global shutter."""
     shaken: Weight = 0.0
-    """The same with a camera that moves while it looks: rolling shutter, motion blur."""
+    """Frequency of static rooms, seen with a rolling shutter and motion blur."""
     people: Weight = 0.0
-    """People walk from view to view."""
+    """Frequency of rooms with walking people."""
     papered: Weight = 0.0
-    """Walls that repeat one pattern exactly."""
+    """Frequency of rooms whose walls repeat one pattern exactly."""
     bare: Weight = 0.0
-    """Next to no texture."""
+    """Frequency of rooms with hardly any texture."""
     street: Weight = 0.0
-    """Houses along a road, with cars and people that move, seen by who drives, walks or turns."""
+    """Frequency of streets with moving cars and people, seen by a driver or a pedestrian."""
 
 
 USUAL, SHAKEN, PEOPLE, PAPERED, BARE, STREET = range(6)
@@ -52,39 +52,39 @@ def only_scene(name: str) -> SceneWeights:
 
 @dataclass(frozen=True)
 class RoomOptions(Settings, group="training.rooms"):
-    """Size and variety of the clips; the defaults are those that the network is trained with."""
+    """Size and variety of the random rooms and of the clips filmed in them."""
 
     width: Annotated[int, Range(16, 8192)] = 512
     """Width of the images, pixels."""
     height: Annotated[int, Range(16, 8192)] = 384
     """Height of the images, pixels."""
     views: Annotated[int, Range(2, 100)] = 2
-    """Per clip; 2 makes pairs, more make short smooth paths."""
+    """Number of views per clip; more than 2 follow a smooth path."""
     least_density: Fraction = 0.12
-    """Least fraction of the places for solids that a room fills (there are about 125)."""
+    """Least fraction of the roughly 125 slots for solids that a room fills."""
     most_density: Annotated[float, Range("least_density", 1)] = 0.5
-    """Largest fraction of them."""
+    """Largest fraction of the slots for solids that a room fills."""
     thin: Fraction = 0.0
-    """Largest fraction of the places for thin things that a room fills: railings, lattices,
-    cables, twigs, chairs."""
+    """Largest fraction of the slots for thin things (railings, lattices, cables, twigs, chairs)
+    that a room fills."""
     motions: MotionWeights = MotionWeights()
     """Kinds of camera motion."""
     scenes: SceneWeights = SceneWeights()
-    """Kinds of scenes. All but the usual ones, and the streets, are rooms with those motions; in
-    two fifths of them the camera moves while it looks, too."""
+    """Kinds of scenes. Streets have motions of their own. Of the clips of people, papered and bare
+    rooms and streets, two fifths have a rolling shutter or motion blur, too."""
     sway: Weight = 0.0
-    """Deviation of the views of longer clips from their path, over the way from view to view."""
+    """Standard deviation of the views of longer clips from a smooth path, over the step length."""
     candidates: Count = 24
-    """Camera paths tried per clip; the first that suits is taken."""
+    """Number of random camera paths per clip, of which the first suitable one is taken."""
     disturbance: Weight = 1.0
-    """Strength of noise, blur, artefacts and changes of exposure; 0 leaves the images clean."""
+    """Strength of noise, blur, artefacts and exposure changes; 0 leaves the images clean."""
     clean: Fraction = 0.3
-    """Fraction of the clips that are nearly undisturbed."""
+    """Fraction of the clips with nearly clean images."""
     light_change: Fraction = 0.15
     """Fraction of the clips whose light changes between the views."""
     textures: Count = 256
-    """Images in the texture bank."""
+    """Number of textures in the bank."""
     texture_size: Annotated[int, Range(2, 8192)] = 512
-    """Side of a texture, texels; a power of two."""
+    """Side of the square textures, texels; a power of two."""
     validation: bool = False
-    """Other rooms and other textures, never seen in training."""
+    """Whether to use the rooms and textures of the validation, which training never sees."""

@@ -7,8 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch
-from geogs_synth.camera.develop import develop
-from geogs_synth.camera.random_flaws import RandomFlaws, draw_flaws
+from geogs_synth.camera.clip_camera import RandomFlaws, develop, draw_flaws
 from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.dynamics import Dynamics, draw_dynamics
 from geogs_synth.clips.furnishing import draw_furnishing
@@ -24,9 +23,6 @@ from geogs_synth.scene.batch import on_device
 from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, room_per_view
 from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
-
-_LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
-"""Least and largest size of a room, metres."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +71,11 @@ class RoomSampler:
     @torch.no_grad()
     def film(self, plan: Plan) -> ClipBatch:
         """Render the clips of a plan."""
-        options, key = self.options, plan.key
+        options = self.options
+        key = plan.key
         plan = on_device(plan, self.device)
-        size, solids = plan.rooms.size, plan.rooms.solids
+        size = plan.rooms.size
+        solids = plan.rooms.solids
         views = choose_cameras(plan.paths, size, solids, options.width, options.height)
         solids = solids.without(too_near(solids, views))
         dynamics = plan.dynamics
@@ -86,16 +84,15 @@ class RoomSampler:
             views = replace(views, sweep=dynamics.shake.sweep)
         rooms = replace(plan.rooms, solids=solids)
         if dynamics is None:
-            rendering = caster_for(self.device).render(rooms, self.bank, views)
-            light = rendering.colour
+            seen = caster_for(self.device).render(rooms, self.bank, views)
+            light = seen.colour
         else:
-            rendering = self._render_moving(rooms, views, dynamics.velocity)
-            light = dynamics.blurred(rendering, views)
+            seen = self._render_moving(rooms, views, dynamics.velocity)
+            light = dynamics.blurred(seen, views)
         images = develop(Draw.keyed(self.device, *key), plan.flaws, light)
         return ClipBatch(
-            images, light, rendering.depth, rendering.normal, rendering.solid,
-            views, solids, dynamics,
-        )  # fmt: skip
+            images, light, seen.depth, seen.normal, seen.solid, views, solids, dynamics
+        )
 
     def _render_moving(
         self, rooms: Rooms, views: CameraBatch, velocity: Float[Tensor, "b n 3"]
@@ -117,7 +114,9 @@ def draw_plan(
     """
     key = (seed, int(options.validation), step, rank)
     draw = Draw.keyed(torch.device("cpu"), *key)
-    size = _draw_sizes(draw, batch)
+    least = torch.tensor([2.5, 2.5, 2.2])  # metres
+    most = torch.tensor([8.0, 8.0, 3.5])
+    size = least + (most - least) * draw.uniform(0, 1, batch, 3)
     layout = draw_furnishing(draw, size, options.least_density, options.most_density, options.thin)
     surfaces = draw_surfaces(draw, layout, options.textures, materials)
     lights = draw_lights(draw, size, options.views, options.light_change)
@@ -128,8 +127,3 @@ def draw_plan(
         return Plan(key, rooms, paths, flaws)
     rooms, paths, dynamics = draw_dynamics(draw, options, rooms, paths, materials)
     return Plan(key, rooms, paths, flaws, dynamics)
-
-
-def _draw_sizes(draw: Draw, rooms: int) -> Float[Tensor, "b 3"]:
-    least, most = torch.tensor(_LEAST), torch.tensor(_MOST)
-    return least + (most - least) * draw.uniform(0, 1, rooms, 3)

@@ -61,9 +61,11 @@ def _houses(draw: Draw, b: int) -> list[SolidBatch]:
     rows = []
     for side in (-1, 1):
         n = (b, _HOUSES // 2)
-        long, gap = draw.uniform(4, 13, *n), draw.uniform(0, 3, *n) * draw.chance(0.3, *n)
+        long = draw.uniform(4, 13, *n)
+        gap = draw.uniform(0, 3, *n) * draw.chance(0.3, *n)
         x = 2 * long.cumsum(-1) - long + gap.cumsum(-1) - draw.uniform(20, 60, b, 1)
-        deep, tall = draw.uniform(3, 8, *n), draw.uniform(2, 14, *n)
+        deep = draw.uniform(3, 8, *n)
+        tall = draw.uniform(2, 14, *n)
         line = draw.uniform(5, 14, b, 1)
         front = line + draw.uniform(0, 1.5, *n) * draw.chance(0.4, *n)
         half = torch.stack([long, deep, tall], -1)
@@ -78,13 +80,13 @@ def _houses(draw: Draw, b: int) -> list[SolidBatch]:
 def _cars(draw: Draw, b: int) -> SolidBatch:
     """Parked cars: a body and a cabin above it."""
     n = (b, _CARS)
-    half = torch.stack([
-        draw.uniform(1.7, 2.6, *n), draw.uniform(0.8, 1.0, *n), draw.uniform(0.4, 0.6, *n)
-    ], -1)  # fmt: skip
+    half = torch.stack(
+        [draw.uniform(1.7, 2.6, *n), draw.uniform(0.8, 1.0, *n), draw.uniform(0.4, 0.6, *n)], -1
+    )
     side = 1 - 2.0 * draw.integers(2, *n)
-    at = torch.stack([
-        draw.uniform(-15, 70, *n), side * draw.uniform(3.5, 6.5, *n), half[..., 2] + 0.2
-    ], -1)  # fmt: skip
+    at = torch.stack(
+        [draw.uniform(-15, 70, *n), side * draw.uniform(3.5, 6.5, *n), half[..., 2] + 0.2], -1
+    )
     top = half * torch.tensor([0.55, 0.9, 0.7])
     above = at + torch.nn.functional.pad((half + top)[..., 2:], (2, 0))
     there = draw.chance(0.5, *n)
@@ -94,7 +96,8 @@ def _cars(draw: Draw, b: int) -> SolidBatch:
 def _trees(draw: Draw, b: int) -> SolidBatch:
     n = (b, _TREES)
     x, y = draw.uniform(-10, 60, *n), draw.uniform(4, 9, *n) * (1 - 2.0 * draw.integers(2, *n))
-    stem, radius = draw.uniform(1.0, 2.5, *n), draw.uniform(0.1, 0.25, *n)
+    stem = draw.uniform(1.0, 2.5, *n)
+    radius = draw.uniform(0.1, 0.25, *n)
     crown = draw.uniform(0.8, 3.0, *n, 3)
     foot = torch.stack([x, y, stem], -1)
     top = torch.stack([x, y, 2 * stem + 0.8 * crown[..., 2]], -1)
@@ -106,7 +109,8 @@ def _trees(draw: Draw, b: int) -> SolidBatch:
 def _posts(draw: Draw, b: int) -> SolidBatch:
     """Lamp posts, signs' posts, bollards."""
     n = (b, _POSTS)
-    tall, radius = draw.log_uniform(0.4, 4.0, *n), draw.log_uniform(0.03, 0.15, *n)
+    tall = draw.log_uniform(0.4, 4.0, *n)
+    radius = draw.log_uniform(0.03, 0.15, *n)
     y = draw.uniform(4, 8, *n) * (1 - 2.0 * draw.integers(2, *n))
     at = torch.stack([draw.uniform(-8, 50, *n), y, tall], -1)
     half = torch.stack([radius, radius, tall], -1)
@@ -152,7 +156,8 @@ def _surfaces(draw: Draw, surfaces: Surfaces) -> Surfaces:
 
 def _lights(draw: Draw, b: int, views: int) -> Lights:
     """A sun, or none, and the sky."""
-    round_, up = draw.uniform(-3.15, 3.15, b), draw.uniform(0.25, 1.3, b)
+    round_ = draw.uniform(-3.15, 3.15, b)
+    up = draw.uniform(0.25, 1.3, b)
     way = torch.stack([round_.cos() * up.cos(), round_.sin() * up.cos(), up.sin()], -1)
     position = torch.zeros(b, MOST_LIGHTS, 3) + torch.tensor([0.0, 0.0, 50.0])
     position[:, 0] = torch.tensor(_MIDDLE) + _SUN * way
@@ -166,22 +171,23 @@ def _lights(draw: Draw, b: int, views: int) -> Lights:
 
 def _paths(draw: Draw, options: RoomOptions, b: int) -> Paths:
     """Driving ahead, walking, and turning; candidates of a street all move in the same manner."""
-    k, v = options.candidates, options.views
-    start = torch.stack([
-        draw.uniform(-6, 6, b, k), draw.uniform(-3.5, 3.5, b, k), draw.uniform(1.1, 2.2, b, k)
-    ], -1)  # fmt: skip
+    k = options.candidates
+    v = options.views
+    start = torch.stack(
+        [draw.uniform(-6, 6, b, k), draw.uniform(-3.5, 3.5, b, k), draw.uniform(1.1, 2.2, b, k)], -1
+    )
     start = SCALE * start + torch.tensor(_MIDDLE)
     way = draw.choose((0.6, 0.25, 0.15), b)[:, None].expand(b, k)  # drives, walks, turns
-    drives, turns = way == 0, way == 2
+    drives = way == 0
+    turns = way == 2
     yaw = torch.where(drives, draw.normal(0.06, b, k), draw.uniform(-3.15, 3.15, b, k))
     pitch = draw.normal(0.06, b, k)
-    forward = torch.stack([
-        yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), pitch.sin()
-    ], -1)  # fmt: skip
+    forward = torch.stack([yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), pitch.sin()], -1)
     length = torch.where(
-        drives, draw.log_uniform(0.25, 3.5, b, k),
+        drives,
+        draw.log_uniform(0.25, 3.5, b, k),
         torch.where(turns, 0.01, draw.log_uniform(0.05, 0.8, b, k)),
-    )  # fmt: skip
+    )
     along = torch.stack([torch.ones(b, k), draw.normal(0.02, b, k), draw.normal(0.01, b, k)], -1)
     across = torch.nn.functional.normalize(draw.normal(1.0, b, k, 3), dim=-1)
     move = SCALE * length[..., None] * torch.where(drives[..., None], along, across)

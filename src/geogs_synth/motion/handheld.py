@@ -18,7 +18,6 @@ FRAMES_PER_SECOND = 30.0
 
 _KNOTS_PER_LAP = 9
 _MIN_CLEARANCE = 0.6
-_SHAKE_STREAM = 0x5A4
 _SHAKE_PERIOD = 7
 _SHAKE_METRES = 0.004
 _SHAKE_RADIANS = np.radians(0.3)
@@ -108,14 +107,21 @@ def with_shake(
 
     ``frames`` are the times of the poses in frames.
     """
-    rng = np.random.default_rng([seed, _SHAKE_STREAM])
+    rng = np.random.default_rng([seed, 0x5A4])
     last = 1 + math.floor(frames.max(initial=0))
     count = last // _SHAKE_PERIOD + 4
     coefficients = np.clip(rng.standard_normal((count, 6)), -2.5, 2.5)
     knots = _SHAKE_PERIOD * np.arange(-3, count + 1)
     tremor = BSpline(knots, coefficients, 3)(frames)
-    shaken = T_wc.copy()
+    shaken = rotated(T_wc, _SHAKE_RADIANS * tremor[:, 3:])
     shaken[:, :3, 3] += _SHAKE_METRES * tremor[:, :3]
-    rotation = Rotation.from_rotvec(_SHAKE_RADIANS * tremor[:, 3:]).as_matrix()
-    shaken[:, :3, :3] = T_wc[:, :3, :3] @ rotation
     return shaken
+
+
+def rotated(
+    T_wc: Float64[np.ndarray, "n 4 4"], angles: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Poses rotated in the camera's frame by rotation vectors."""
+    found = T_wc.copy()
+    found[:, :3, :3] = T_wc[:, :3, :3] @ Rotation.from_rotvec(angles).as_matrix()
+    return found

@@ -1,4 +1,4 @@
-"""Names of the kinds of camera motion."""
+"""Names of the kinds of camera motion and of light."""
 
 from typing import Literal, get_args
 
@@ -11,3 +11,5 @@ ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
 MotionKind = Literal[RoomMotionKind, "dining", "driving", "corridor"]
 """Motions through a room, around a table in a room of thin things, along a street, or along a
 corridor almost without texture."""
+LampKind = Literal["steady", "switched"]
+"""Constant lamps, or other lamps in each third of the sequence."""

@@ -7,14 +7,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from geogs_synth.motion.handheld import (
     FRAMES_PER_LAP,
     FRAMES_PER_SECOND,
     HandheldPath,
     look_at,
+    rotated,
     with_shake,
 )
 from geogs_synth.motion.motion_kinds import RoomMotionKind
@@ -40,7 +39,7 @@ _GOING, _STOPPING = 1.3, 0.4
 _AWAY_DEGREES, _AWAY, _AWAY_HOLD = 120.0, 1.6, 0.2
 """Rotation away in degrees, its seconds either way, and those between."""
 _JERK_PERIOD, _JERK_HALF_LENGTH = 0.9, 0.12
-_TURN_STREAM, _JERK_STREAM = 0x704, 0x3E6
+_TURN_STREAM = 0x704
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,11 @@ def room_motion(kind: RoomMotionKind, scene: Scene, seed: int = 0) -> Motion:
         InputError: the room has no space for it.
     """
     match kind:
-        case "handheld":
-            return Motion(HandheldPath(scene, seed))
+        case "handheld" | "handheld-5hz":
+            rate = 5.0 if kind == "handheld-5hz" else FRAMES_PER_SECOND
+            return Motion(HandheldPath(scene, seed), rate)
         case "slow-handheld":
             return Motion(_slow(scene, seed))
-        case "handheld-5hz":
-            return Motion(HandheldPath(scene, seed), rate=5.0)
         case "walking":
             return Motion(_walking(scene, seed))
         case "turning-30" | "turning-60" | "turning-120":
@@ -96,16 +94,18 @@ def _walking(scene: Scene, seed: int) -> Path:
 
     def path(times: np.ndarray) -> np.ndarray:
         lap = times / seconds_per_lap % 1.0
-        position, inwards = handheld.position(lap), handheld.target(lap) - handheld.position(lap)
+        position = handheld.position(lap)
+        inwards = handheld.target(lap) - handheld.position(lap)
         along = ahead(lap)
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
         T_wc = look_at(position, position + along + 0.6 * inwards)
-        step, stride = 2 * np.pi * _STEP_RATE * times, np.pi * _STEP_RATE * times
+        step = 2 * np.pi * _STEP_RATE * times
+        stride = np.pi * _STEP_RATE * times
         T_wc[:, :3, 3] += _SWAY * np.sin(stride)[:, None] * T_wc[:, :3, 0]
         T_wc[:, 2, 3] += _BOB * np.cos(step)
         nod = np.stack([np.sin(step), np.cos(stride), np.sin(stride)], 1)
-        return _rotated(T_wc, np.radians(_GAIT_DEGREES) * nod)
+        return rotated(T_wc, np.radians(_GAIT_DEGREES) * nod)
 
     return path
 
@@ -145,7 +145,7 @@ def _pure_rotation(scene: Scene, seed: int) -> Path:
         T_wc = look_at(centre, centre + ahead.T)
         T_wc[:, :3, 3] = position
         roll = np.radians(2 * np.sin(2 * np.pi * times / 4.7))
-        return _rotated(T_wc, np.stack([0 * roll, 0 * roll, roll], 1))
+        return rotated(T_wc, np.stack([0 * roll, 0 * roll, roll], 1))
 
     return path
 
@@ -158,12 +158,12 @@ def _turn_away(path: Path, seed: int) -> Path:
     def turned_away(times: np.ndarray) -> np.ndarray:
         stop = np.clip(times - _GOING, 0, _STOPPING)
         go = np.clip(times - (_GOING + _STOPPING + standing), 0, None)
-        eased = np.where(go < _STOPPING, 0.5 * go**2 / _STOPPING, go - 0.5 * _STOPPING)
-        walked = np.minimum(times, _GOING) + stop - 0.5 * stop**2 / _STOPPING + eased
+        walked = np.minimum(times, _GOING) + stop - 0.5 * stop**2 / _STOPPING
+        walked = walked + _speeding_up(go, _STOPPING)
         turn = times - (_GOING + _STOPPING)
         there, back = (np.clip(t / _AWAY, 0, 1) for t in (turn, turn - _AWAY - _AWAY_HOLD))
         yaw = np.radians(_AWAY_DEGREES) * 0.5 * (np.cos(np.pi * back) - np.cos(np.pi * there))
-        return _rotated(path(walked), np.stack([0 * yaw, sense * yaw, 0 * yaw], 1))
+        return rotated(path(walked), np.stack([0 * yaw, sense * yaw, 0 * yaw], 1))
 
     return turned_away
 
@@ -172,9 +172,7 @@ def _from_rest(path: Path) -> Path:
     """Stand perfectly still at first, then start to move."""
 
     def rested(times: np.ndarray) -> np.ndarray:
-        going = np.clip(times - _REST, 0, None)
-        eased = 0.5 * going**2 / _GETTING_GOING
-        return path(np.where(going < _GETTING_GOING, eased, going - 0.5 * _GETTING_GOING))
+        return path(_speeding_up(np.clip(times - _REST, 0, None), _GETTING_GOING))
 
     return rested
 
@@ -186,14 +184,14 @@ def _with_jerks(path: Path, seed: int) -> Path:
         T_wc = path(times).copy()
         knock = np.zeros((len(times), 6))
         for k in range(max(0, int(times.max(initial=0) / _JERK_PERIOD) + 2)):
-            rng = np.random.default_rng([seed, _JERK_STREAM, k])
+            rng = np.random.default_rng([seed, 0x3E6, k])
             middle = (k + 1 + rng.uniform(-0.3, 0.3)) * _JERK_PERIOD
             size = rng.choice((-1.0, 1.0), 6) * rng.uniform(0.5, 1.0, 6)
             size *= np.array([*np.radians([6.0, 10.0, 3.0]), 0.04, 0.03, 0.02])
             near = np.clip((times - middle) / _JERK_HALF_LENGTH, -1, 1)
             knock += 0.5 * (1 + np.cos(np.pi * near))[:, None] * size
         T_wc[:, :3, 3] += np.einsum("nij,nj->ni", T_wc[:, :3, :3], knock[:, 3:])
-        return _rotated(T_wc, knock[:, :3])
+        return rotated(T_wc, knock[:, :3])
 
     return jerky
 
@@ -205,10 +203,6 @@ def _still(scene: Scene, seed: int) -> Path:
     return lambda times: np.repeat(T_wc, len(times), 0)
 
 
-def _rotated(
-    T_wc: Float64[np.ndarray, "n 4 4"], angles: Float64[np.ndarray, "n 3"]
-) -> Float64[np.ndarray, "n 4 4"]:
-    """Poses rotated in the camera's frame by rotation vectors."""
-    rotated = T_wc.copy()
-    rotated[:, :3, :3] = T_wc[:, :3, :3] @ Rotation.from_rotvec(angles).as_matrix()
-    return rotated
+def _speeding_up(seconds: np.ndarray, ramp: float) -> np.ndarray:
+    """Seconds of the full speed that lead as far as a start from rest, full after ``ramp``."""
+    return np.where(seconds < ramp, 0.5 * seconds**2 / ramp, seconds - 0.5 * ramp)

@@ -23,7 +23,6 @@ _SPEED, _RATE = 1.17, 15.0
 _LOOK_DEGREES, _LOOK_PERIOD = 9.0, 3.6
 """Rotation of the camera to either side in degrees, and its period in seconds."""
 _TEXEL = 0.004
-_CORRIDOR_STREAM, _WALK_STREAM = 0xC0D, 0xC0E
 
 
 def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
@@ -32,12 +31,13 @@ def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
     Painted panels on the walls and under the ceiling, one tone each, with narrow joints; tiles on
     the floor; doors of one colour, lamps, at either end a door, and here and there a sign.
     """
-    rng = np.random.default_rng([seed, _CORRIDOR_STREAM])
+    rng = np.random.default_rng([seed, 0xC0D])
     width = rng.uniform(2.0, 2.6)
     build = SceneBuilder(rng)
     grey = rng.uniform(198, 222)
     white = (grey, grey, grey - 4)
-    panel, tile = rng.uniform(0.9, 1.25), rng.uniform(0.3, 0.6)
+    panel = rng.uniform(0.9, 1.25)
+    tile = rng.uniform(0.3, 0.6)
     contrast = rng.uniform(0.06, 0.15)
 
     def surface(size: tuple[float, float], cell: tuple[float, float], tone: float) -> int:
@@ -46,7 +46,8 @@ def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
         colour = (tone * white[0], tone * white[1], tone * white[2])
         return build.texture(patterns.panels(rng, shape, cells, colour, contrast))
 
-    middle, flat = (length / 2, width / 2), (length, width)
+    middle = (length / 2, width / 2)
+    flat = (length, width)
     floor = surface(flat, (tile, tile), rng.uniform(0.55, 0.8))
     build.rectangle((*middle, 0), flat, floor, np.eye(3))
     ceiling = surface(flat, (0.6, 0.6), 0.95)
@@ -70,8 +71,9 @@ def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
 
 def walk(scene: Scene, seed: int = 0) -> Motion:
     """A walk along the corridor; the camera rotates a little to one side and to the other."""
-    rng = np.random.default_rng([seed, _WALK_STREAM])
-    phases, middle = rng.uniform(0, 2 * np.pi, 3), scene.size[1] / 2
+    rng = np.random.default_rng([seed, 0xC0E])
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    middle = scene.size[1] / 2
 
     def path(times: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
         x = _START + _SPEED * times

@@ -64,7 +64,8 @@ def railing(
     build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float
 ) -> None:
     """A row of balusters between two rails, and posts at its ends."""
-    height, thick = rng.uniform(0.85, 1.0), rng.uniform(0.018, 0.03)
+    height = rng.uniform(0.85, 1.0)
+    thick = rng.uniform(0.018, 0.03)
     for z in (0.1, height):
         build.box((0, 0, z), (width, 0.05, 0.04), materials.oak)
     for side in (-1, 1):
@@ -78,7 +79,9 @@ def lattice(
     build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float
 ) -> None:
     """A frame with upright and level bars that cross."""
-    height, bar, cell = 1.8, rng.uniform(0.012, 0.02), rng.uniform(0.16, 0.24)
+    height = 1.8
+    bar = rng.uniform(0.012, 0.02)
+    cell = rng.uniform(0.16, 0.24)
     for x in np.linspace(-width / 2, width / 2, round(width / cell) + 1):
         build.box((x, 0, height / 2 + 0.05), (bar, bar, height), materials.lacquer)
     for z in np.linspace(0.1, height, round(height / cell) + 1):
@@ -87,7 +90,9 @@ def lattice(
 
 def _console(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
     """A narrow high table on four thin legs, with objects on it."""
-    width, depth, height = rng.uniform(1.2, 1.6), 0.36, 0.8
+    width = rng.uniform(1.2, 1.6)
+    depth = 0.36
+    height = 0.8
     build.box((0, depth / 2, height - 0.015), (width, depth, 0.03), materials.walnut)
     furniture.four_legs(build, width, depth, height - 0.03, 0.03, materials.metal)
     build.box((0, depth / 2, 0.2), (width - 0.06, depth - 0.06, 0.02), materials.walnut)
@@ -97,12 +102,14 @@ def _console(build: SceneBuilder, rng: np.random.Generator, materials: Materials
 
 def _table_and_chairs(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
     """A table and six chairs, pushed under it or turned a little, no two alike."""
-    width, depth = rng.uniform(1.5, 1.8), rng.uniform(0.85, 0.95)
+    width = rng.uniform(1.5, 1.8)
+    depth = rng.uniform(0.85, 0.95)
     top = (width, depth, 0.03)
     build.box((0, 0, _TABLE_HEIGHT - 0.015), top, materials.walnut)
     legs = build.at(0, -depth / 2)
     furniture.four_legs(legs, width, depth, _TABLE_HEIGHT - 0.03, 0.05, materials.walnut)
-    side, end = depth / 2 - _CHAIR_IN, width / 2 - _CHAIR_IN
+    side = depth / 2 - _CHAIR_IN
+    end = width / 2 - _CHAIR_IN
     places = [(s * width / 4, t * side, (1 - t) * math.pi / 2) for s in (-1, 1) for t in (-1, 1)]
     places += [(end, 0.0, -math.pi / 2), (-end, 0.0, math.pi / 2)]
     for x, y, yaw in places:

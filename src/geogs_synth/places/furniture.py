@@ -79,12 +79,15 @@ def _row_of_books(
     """Upright books from x = 0 to at most ``width``, lower than ``room``, spines at y = 0."""
     x = 0.0
     while True:
-        thick, tall = rng.uniform(0.018, 0.055), room * rng.uniform(0.62, 0.95)
+        thick = rng.uniform(0.018, 0.055)
+        tall = room * rng.uniform(0.62, 0.95)
         if x + thick > width:
             return
-        deep, back = rng.uniform(0.15, 0.2), rng.uniform(0.0, 0.03)
+        deep = rng.uniform(0.15, 0.2)
+        back = rng.uniform(0.0, 0.03)
         centre = (x + thick / 2, -back - deep / 2, tall / 2)
-        cloth, spine = _pick(rng, materials.cloth), _pick(rng, materials.spines)
+        cloth = _pick(rng, materials.cloth)
+        spine = _pick(rng, materials.spines)
         build.box(centre, (thick, deep, tall), cloth, front=spine)
         x += thick + (rng.uniform(0.02, 0.12) if rng.random() < 0.12 else 0.001)
 
@@ -128,7 +131,9 @@ def bookshelf(
     build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float
 ) -> None:
     """A tall open shelf with rows of books and a few objects."""
-    height, depth, board = rng.uniform(1.8, 2.1), 0.32, 0.025
+    height = rng.uniform(1.8, 2.1)
+    depth = 0.32
+    board = 0.025
     build.box((0, 0.01, height / 2), (width, 0.02, height), materials.lacquer)
     for side in (-1, 1):
         x = side * (width - board) / 2
@@ -136,7 +141,8 @@ def bookshelf(
     levels = np.linspace(0.06, height - board / 2, 6)
     for z in levels:
         build.box((0, depth / 2, z), (width - 2 * board, depth, board), materials.oak)
-    room, inner = levels[1] - levels[0] - board, width - 2 * board
+    room = levels[1] - levels[0] - board
+    inner = width - 2 * board
     for z in levels[:-1] + board / 2:
         books = inner if rng.random() < 0.5 else inner * rng.uniform(0.4, 0.7)
         row = build.at(-inner / 2, depth - 0.04, z)
@@ -147,7 +153,8 @@ def bookshelf(
 
 def sofa(build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float) -> None:
     """Seat, back, arms, cushions."""
-    depth, seat = 0.88, 0.4
+    depth = 0.88
+    seat = 0.4
     build.box((0, depth / 2 + 0.03, 0.2), (width, depth, 0.24), materials.sofa)
     build.box((0, 0.13, 0.45), (width, 0.2, 0.72), materials.sofa)
     for side in (-1, 1):
@@ -162,7 +169,8 @@ def sofa(build: SceneBuilder, rng: np.random.Generator, materials: Materials, wi
         size = (inner / 3 - 0.03, 0.14, 0.42)
         build.box((x, 0.31, seat + 0.26), size, materials.sofa, rotation=lean)
     for _ in range(3):
-        x, pillow = rng.uniform(-0.4, 0.4) * inner, _pick(rng, materials.cushion)
+        x = rng.uniform(-0.4, 0.4) * inner
+        pillow = _pick(rng, materials.cushion)
         rotation = yaw_rotation(rng.uniform(-0.4, 0.4)) @ _pitch_rotation(0.4)
         build.box((x, 0.5, seat + 0.2), (0.36, 0.11, 0.36), pillow, rotation=rotation)
 
@@ -175,7 +183,8 @@ def _pitch_rotation(angle: float) -> np.ndarray:
 
 def desk(build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float) -> None:
     """A desk with drawers, a picture screen, objects, and a chair drawn up to it."""
-    depth, height = 0.62, 0.74
+    depth = 0.62
+    height = 0.74
     build.box((0, depth / 2, height - 0.015), (width, depth, 0.03), materials.walnut)
     four_legs(build, width, depth, height - 0.03, 0.05, materials.walnut)
     side = rng.choice((-1.0, 1.0))
@@ -209,7 +218,9 @@ def sideboard(
     build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float
 ) -> None:
     """A low cabinet with doors, vases and books on top."""
-    depth, bottom, height = 0.42, 0.14, 0.6
+    depth = 0.42
+    bottom = 0.14
+    height = 0.6
     four_legs(build, width, depth, bottom, 0.04, materials.metal)
     body = (width, depth, height)
     build.box((0, depth / 2, bottom + height / 2), body, materials.walnut)
@@ -243,7 +254,8 @@ def plant(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -
     build.frustum((0, 0, 0), (0.12, 0.17), 0.3, _pick(rng, materials.ceramic))
     build.frustum((0, 0, 0.3), (0.02, 0.012), 0.45, materials.walnut)
     for k in range(16):
-        yaw, rise = 2.4 * k, rng.uniform(-0.5, 0.9)
+        yaw = 2.4 * k
+        rise = rng.uniform(-0.5, 0.9)
         direction = np.array([math.cos(yaw), math.sin(yaw), 0]) * math.cos(rise)
         direction[2] = math.sin(rise)
         tilt = np.array([0, math.sin(rise), math.cos(rise)])
@@ -261,7 +273,8 @@ def _roll_rotation(angle: float) -> np.ndarray:
 
 def round_table(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
     """A low round table on one foot, with objects."""
-    radius, height = rng.uniform(0.38, 0.48), rng.uniform(0.4, 0.45)
+    radius = rng.uniform(0.38, 0.48)
+    height = rng.uniform(0.4, 0.45)
     build.frustum((0, 0, 0), (0.24, 0.2), 0.03, materials.oak)
     build.frustum((0, 0, 0.03), (0.06, 0.04), height - 0.06, materials.oak)
     build.frustum((0, 0, height - 0.03), (radius, radius), 0.03, materials.walnut)

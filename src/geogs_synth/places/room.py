@@ -177,7 +177,8 @@ def _furnish_middle(
     table = rng.uniform(-0.2, 0.2, 2)
     furniture.round_table(middle.at(table[0], table[1], 0.012), rng, materials)
     for _ in range(3):
-        r, angle = rng.uniform(0.06, 0.14), rng.uniform(0, 2 * math.pi)
+        r = rng.uniform(0.06, 0.14)
+        angle = rng.uniform(0, 2 * math.pi)
         x, y = table + rng.uniform(0.62, 0.8) * np.array([math.cos(angle), math.sin(angle)])
         ball = materials.ceramic[rng.integers(len(materials.ceramic))]
         middle.ellipsoid((x, y, 0.012 + r), (r, r, r), ball)

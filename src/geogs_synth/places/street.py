@@ -1,14 +1,16 @@
 """A street between houses from a seed, and a drive along it."""
 
+import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from geogs_synth.motion.handheld import look_at
 from geogs_synth.motion.room_motions import Motion
 from geogs_synth.places.vehicles import VehicleMaterials, car, draw_materials
 from geogs_synth.scene.builder import SceneBuilder
 from geogs_synth.scene.textured_scene import Scene, Texture
-from geogs_synth.textures import artwork, facades, patterns
+from geogs_synth.textures import artwork, patterns
+from geogs_synth.textures.patterns import Colour, finish, fractal_noise
 
 LENGTH = 260.0
 DRIVE_METRES = 205.0
@@ -26,7 +28,9 @@ START = 14.0
 _SPEED, _SPEED_WAVE, _SPEED_PERIOD = 10.0, 4.0, 12.0
 _EYE_HEIGHT = 1.65
 _SUN = (-60.0, -120.0, 240.0)
-_STREET_STREAM, _DRIVE_STREAM = 0x57E, 0xD71
+_DRIVE_STREAM = 0xD71
+FACADE_TEXEL, ROAD_TEXEL = 0.022, 0.0125
+"""Metres per texel."""
 
 
 def heading(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
@@ -47,7 +51,7 @@ def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
     House fronts with windows on either side, a road with markings, pavements, parked cars, trees,
     poles with signs; above them the sky.
     """
-    rng = np.random.default_rng([seed, _STREET_STREAM])
+    rng = np.random.default_rng([seed, 0x57E])
     build = SceneBuilder(rng)
     _ground(build, rng, length)
     materials = draw_materials(build, rng)
@@ -59,7 +63,7 @@ def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
     sun = np.array([length / 2, _WIDTH / 2, 0]) + _SUN
     strength = 1.2 * float(np.dot(_SUN, _SUN))
     build.light(sun, (1.05 * strength, strength, 0.92 * strength), 3.0)
-    return build.build((length, _WIDTH, _HEIGHT), Texture(facades.sky(rng), 0.0))
+    return build.build((length, _WIDTH, _HEIGHT), Texture(_sky(rng), 0.0))
 
 
 def drive(seed: int = 0) -> Motion:
@@ -108,7 +112,7 @@ def _ground(build: SceneBuilder, rng: np.random.Generator, length: float) -> Non
     """Bare ground all around, the road and the pavements in sections."""
     bare = build.texture(patterns.plaster(rng, (1024, 1024), (126, 122, 104)), 0.02)
     build.rectangle((length / 2, _WIDTH / 2, 0), (900, 700), bare, np.eye(3))
-    surfaces = [build.texture(facades.road(rng, _SECTION + 0.6, 2 * _ROAD_HALF)) for _ in range(8)]
+    surfaces = [build.texture(_road(rng, _SECTION + 0.6, 2 * _ROAD_HALF)) for _ in range(8)]
     slabs = build.texture(
         patterns.tiles(rng, (768, 768), 16, ((150, 146, 138), (136, 132, 126))), 0.008
     )
@@ -132,11 +136,12 @@ def _houses(build: SceneBuilder, rng: np.random.Generator, side: int, length: fl
         width, height, depth = rng.uniform([8, 6.0, 6], [14, 14.0, 8])
         middle = x + width / 2
         house = _section(build, middle, side * (front_at + rng.uniform(0, 0.5)), backwards=side > 0)
-        front = build.texture(facades.facade(rng, width, height))
+        front = build.texture(_facade(rng, width, height))
         house.box((0, -depth / 2, height / 2), (width, depth, height), plain, front=front)
         house.box((0, -depth / 2, height + 0.15), (width + 0.3, depth + 0.6, 0.3), plain)
         for _ in range(int(rng.integers(0, 4))):
-            across, storey = rng.uniform(-0.4, 0.4) * width, rng.integers(1, max(2, height // 3))
+            across = rng.uniform(-0.4, 0.4) * width
+            storey = rng.integers(1, max(2, height // 3))
             z = storey * 3.0
             house.box((across, 0.4, z), (1.6, 0.8, 0.12), plain)
             house.box((across, 0.78, z + 0.45), (1.6, 0.05, 0.8), plain)
@@ -194,8 +199,93 @@ def _pole(spot: SceneBuilder, rng: np.random.Generator, metal: int, side: int) -
 
 def _end(build: SceneBuilder, rng: np.random.Generator, length: float) -> None:
     """A large house across the end of the street."""
-    front = build.texture(facades.facade(rng, 30.0, 15.0))
+    front = build.texture(_facade(rng, 30.0, 15.0))
     plain = build.texture(patterns.plaster(rng, (512, 512), (150, 140, 130)), 0.01)
     house = _section(build, length - 1.0)
     # Its +y face looks back along the street.
     house.at(0, 0, yaw=np.pi / 2).box((0, -3, 7.5), (30, 6, 15), plain, front=front)
+
+
+def _facade(rng: np.random.Generator, width: float, height: float) -> UInt8[np.ndarray, "h w 3"]:
+    """A front of brick or plaster with rows of windows and a door; sizes in metres."""
+    shape = (round(height / FACADE_TEXEL), round(width / FACADE_TEXEL))
+    red, green, blue = rng.uniform([120, 95, 75], [215, 195, 170])
+    colour: Colour = (float(red), float(green), float(blue))
+    if rng.random() < 0.5:
+        image = patterns.brick(rng, shape, max(8, round(height / 0.14)), colour)
+    else:
+        image = patterns.plaster(rng, shape, colour)
+    image = np.ascontiguousarray(image)
+    storeys = max(2, round(height / 3.0))
+    columns = max(2, round(width / 2.6))
+    door = int(rng.integers(columns))
+    glass = float(rng.uniform(40, 90))
+    for storey in range(storeys):
+        for column in range(columns):
+            middle = (column + 0.5) * width / columns
+            bottom = storey * height / storeys
+            if storey == 0 and column == door:
+                _opening(rng, image, height, (middle, 0.0), (1.2, 2.3), 90.0)
+            else:
+                size = (1.3, min(1.6, 0.6 * height / storeys))
+                _opening(rng, image, height, (middle, bottom + 0.9), size, glass)
+    return image
+
+
+def _opening(
+    rng: np.random.Generator,
+    image: UInt8[np.ndarray, "h w 3"],
+    height: float,
+    foot: tuple[float, float],
+    size: tuple[float, float],
+    glass: float,
+) -> None:
+    """A window or door with frame and bars, its lower edge in the middle at ``foot`` metres."""
+    low = np.array([foot[0] - size[0] / 2, height - foot[1] - size[1]]) / FACADE_TEXEL
+    high = np.array([foot[0] + size[0] / 2, height - foot[1]]) / FACADE_TEXEL
+    (left, top), (right, bottom) = low.astype(int).tolist(), high.astype(int).tolist()
+    left, top, bottom = max(left, 0), max(top, 0), min(bottom, image.shape[0])
+    shape = image[top:bottom, left:right].shape[:2]
+    if min(shape) < 8:
+        return
+    reflection = fractal_noise(rng, shape, (3, 3), 5, 0.8)
+    pane = np.array([0.9, 1.0, 1.15]) * glass * (1 + 0.35 * reflection[..., None])
+    image[top:bottom, left:right] = finish(pane)
+    frame = tuple(float(c) for c in rng.uniform(150, 240, 3))
+    bar = max(2, round(0.06 / FACADE_TEXEL))
+    cv2.rectangle(image, (left, top), (right - 1, bottom - 1), frame, 2 * bar)
+    middle = (left + right) // 2
+    cv2.line(image, (middle, top), (middle, bottom - 1), frame, bar)
+    third = top + (bottom - top) // 3
+    cv2.line(image, (left, third), (right - 1, third), frame, bar)
+
+
+def _road(rng: np.random.Generator, length: float, width: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Asphalt with patches, cracks and markings; runs along x, sizes in metres."""
+    shape = (round(width / ROAD_TEXEL), round(length / ROAD_TEXEL))
+    ground = patterns.plaster(rng, shape, (104, 104, 108)).astype(np.float32)
+    grit = fractal_noise(rng, shape, (shape[0] / 3, shape[1] / 3), 2)
+    patches = np.clip(2 * fractal_noise(rng, shape, (3, 4), 4, 0.6) - 1.5, 0, 1)
+    image = ground * (1 + 0.09 * grit - 0.3 * patches)[..., None]
+    worn = 0.75 + 0.15 * fractal_noise(rng, shape, (12, 12), 5, 0.8)
+    paint = np.zeros(shape, np.float32)
+    line = round(0.14 / ROAD_TEXEL)
+    middle = shape[0] // 2
+    paint[middle - line // 2 : middle + line // 2 + 1, : round(0.45 * shape[1])] = 1
+    for edge in (round(0.13 * shape[0]), round(0.87 * shape[0])):
+        paint[edge - line // 2 : edge + line // 2 + 1] = 1
+    alpha = (paint * np.clip(worn, 0, 1))[..., None]
+    return finish(image * (1 - alpha) + 225 * alpha)
+
+
+def _sky(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """Blue with clouds above the horizon, haze below; rows are latitudes from the zenith down."""
+    h, w = 512, 2048
+    latitude = np.linspace(90, -90, h)[:, None]
+    rise = np.clip(latitude / 60, 0, 1)[..., None]
+    image = (1 - rise) * np.array([214, 224, 236.0]) + rise * np.array([96, 142, 208.0])
+    clouds = fractal_noise(rng, (h, w), (8, 12), 6, 0.6)[..., None]
+    alpha = np.clip(1.2 * clouds - 0.3, 0, 0.85) * np.clip(latitude / 8, 0, 1)[..., None]
+    image = np.broadcast_to(image, (h, w, 3)) * (1 - alpha) + 246 * alpha
+    image = np.where(latitude[..., None] < -0.5, np.array([150, 152, 146.0]), image)
+    return finish(image)

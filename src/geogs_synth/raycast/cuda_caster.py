@@ -25,11 +25,13 @@ class CudaCaster(CpuCaster):
     def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:
         """Render every view."""
         b, v = views.T_cw.shape[:2]
-        shape, device = (b, v, views.height, views.width), views.T_cw.device
+        shape = (b, v, views.height, views.width)
+        device = views.T_cw.device
         depth = torch.empty(shape, device=device)
         colour, normal = (torch.empty(b, v, 3, *shape[2:], device=device) for _ in range(2))
         solid = torch.empty(shape, dtype=torch.int32, device=device)
-        count, lights = _count(rooms.solids), rooms.lights.position.shape[2]
+        count = _count(rooms.solids)
+        lights = rooms.lights.position.shape[2]
         kernels_for(SOURCE, device)["render_rooms"](
             _grid(views, b * v), _BLOCK, rooms.size.float().contiguous(),
             packed_solids(rooms.solids), rooms.surfaces.packed(), rooms.lights.packed(),
@@ -53,9 +55,12 @@ class CudaCaster(CpuCaster):
         return FlowTruth(pixels, visible, valid)
 
     def first_hit(
-        self, size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
+        self,
+        size: Float[Tensor, "b 3"],
+        solids: SolidBatch,
+        origin: Float[Tensor, "b m 3"],
         direction: Float[Tensor, "b m 3"],
-    ) -> Hit:  # fmt: skip
+    ) -> Hit:
         """First hit of each ray from inside a room."""
         b, rays = origin.shape[:2]
         t = torch.empty(b, rays, device=origin.device)

@@ -36,6 +36,16 @@ class Textures(NamedTuple):
     texel: np.ndarray  # m, metres; 0 stretches over the face
 
 
+class Traced(NamedTuple):
+    """Hits, colours and normals of the pixels of a view."""
+
+    depth: np.ndarray  # h w; inf where nothing is hit
+    solid: np.ndarray  # h w; -1 where nothing is hit
+    face: np.ndarray  # h w
+    image: np.ndarray  # h w 3
+    normal: np.ndarray  # h w 3, camera frame
+
+
 class Lighting(NamedTuple):
     """Lights, and the fraction of each that is visible from every cell of the room."""
 
@@ -50,7 +60,8 @@ class Lighting(NamedTuple):
 @njit(**COMPILED)
 def _hit_pixel(solids, i, x, y):
     """Depth and face at which the pixel ray (x, y, 1) meets solid i."""
-    o, m = solids.origin[i], solids.matrix[i]
+    o = solids.origin[i]
+    m = solids.matrix[i]
     dx = m[0, 0] * x + m[0, 1] * y + m[0, 2]
     dy = m[1, 0] * x + m[1, 1] * y + m[1, 2]
     dz = m[2, 0] * x + m[2, 1] * y + m[2, 2]
@@ -58,7 +69,7 @@ def _hit_pixel(solids, i, x, y):
 
 
 @njit(**COMPILED)
-def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
+def cast_rows(solids, bounds, xs, ys, first, last, traced):
     """Nearest solid in rows [first, last) of the rays (xs, ys, 1), both rows x columns.
 
     ``bounds`` are (left, top, right, bottom) in pixels, a row for each solid.
@@ -67,10 +78,10 @@ def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
         for row in range(max(first, bounds[i, 1]), min(last, bounds[i, 3])):
             for column in range(bounds[i, 0], bounds[i, 2]):
                 t, f = _hit_pixel(solids, i, xs[row, column], ys[row, column])
-                if t < depth[row, column]:
-                    depth[row, column] = t
-                    solid[row, column] = i
-                    face[row, column] = f
+                if t < traced.depth[row, column]:
+                    traced.depth[row, column] = t
+                    traced.solid[row, column] = i
+                    traced.face[row, column] = f
 
 
 @njit(**COMPILED)
@@ -100,10 +111,13 @@ def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
     if wrap:
         u, v = u - math.floor(u), v - math.floor(v)
     u, v = u * w - 0.5, v * h - 0.5
-    c, r = math.floor(u), math.floor(v)
+    c = math.floor(u)
+    r = math.floor(v)
     fu, fv = u - c, v - r
-    c0, r0 = int(c), int(r)
-    c1, r1 = c0 + 1, r0 + 1
+    c0 = int(c)
+    r0 = int(r)
+    c1 = c0 + 1
+    r1 = r0 + 1
     # Beyond the border: the opposite border, or the border itself.
     c0 = (c0 if c0 >= 0 else (w - 1 if wrap else 0)) if c0 < w else w - 1
     r0 = (r0 if r0 >= 0 else (h - 1 if wrap else 0)) if r0 < h else h - 1
@@ -119,12 +133,15 @@ def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
 @njit(**COMPILED)
 def _texture_colour(solids, textures, i, face, point, footprint, out):
     """Texture of a surface point, low-passed to ``footprint`` metres (trilinear filtering)."""
-    kind, half = solids.kind[i], solids.half[i]
+    kind = solids.kind[i]
+    half = solids.half[i]
     across, up, face_width, face_height = _surface_coordinates(
         kind, half, face, point[0], point[1], point[2]
     )
     j = solids.texture[i, face]
-    start, width, height = textures.start[j], textures.width[j], textures.height[j]
+    start = textures.start[j]
+    width = textures.width[j]
+    height = textures.height[j]
     texel = textures.texel[j]
     wrap = texel > 0.0 or kind != BOX
     if texel > 0.0:
@@ -136,12 +153,19 @@ def _texture_colour(solids, textures, i, face, point, footprint, out):
     level = min(max(math.log2(footprint / texel), 0.0), len(start) - 1.0)
     low = int(level)
     part = level - low
-    for k in range(3):
-        out[k] = 0.0
+    out[:] = 0.0
     _add_bilinear(textures.texels, start[low], width[low], height[low], u, v, wrap, 1 - part, out)
     if part > 0.0:
         k = low + 1
         _add_bilinear(textures.texels, start[k], width[k], height[k], u, v, wrap, part, out)
+
+
+@njit(**COMPILED)
+def _bilinear(volume, z, y, x, channel, fx, fy):
+    """Value between four cells of a slice of the light volume."""
+    near = (1 - fx) * volume[z, y, x, channel] + fx * volume[z, y, x + 1, channel]
+    far = (1 - fx) * volume[z, y + 1, x, channel] + fx * volume[z, y + 1, x + 1, channel]
+    return (1 - fy) * near + fy * far
 
 
 @njit(**COMPILED)
@@ -150,7 +174,8 @@ def _light(lighting, point, normal, out):
 
     With a display gamma of 2, textures hold sqrt(albedo): times this gain, the displayed radiance.
     """
-    volume, voxel = lighting.volume, lighting.voxel
+    volume = lighting.volume
+    voxel = lighting.voxel
     nz, ny, nx, channels = volume.shape
     # Half a voxel off the surface, so that the cells read lie in front of it.
     gx = min(max((point[0] + 0.7 * voxel * normal[0]) / voxel - 0.5, 0.0), nx - 1.001)
@@ -159,17 +184,11 @@ def _light(lighting, point, normal, out):
     x, y, z = int(gx), int(gy), int(gz)
     fx, fy, fz = gx - x, gy - y, gz - z
     sky = 0.5 + 0.5 * normal[2]
-    for k in range(3):
-        out[k] = 0.0
+    out[:] = 0.0
     for channel in range(channels):
-        near = (1 - fy) * (
-            (1 - fx) * volume[z, y, x, channel] + fx * volume[z, y, x + 1, channel]
-        ) + fy * ((1 - fx) * volume[z, y + 1, x, channel] + fx * volume[z, y + 1, x + 1, channel])
-        z1 = z + 1
-        far = (1 - fy) * (
-            (1 - fx) * volume[z1, y, x, channel] + fx * volume[z1, y, x + 1, channel]
-        ) + fy * ((1 - fx) * volume[z1, y + 1, x, channel] + fx * volume[z1, y + 1, x + 1, channel])
-        seen = (1 - fz) * near + fz * far
+        low = _bilinear(volume, z, y, x, channel, fx, fy)
+        high = _bilinear(volume, z + 1, y, x, channel, fx, fy)
+        seen = (1 - fz) * low + fz * high
         if channel == 0:
             for k in range(3):
                 out[k] += seen * (lighting.above[k] * sky + lighting.below[k] * (1.0 - sky))
@@ -189,7 +208,9 @@ def _light(lighting, point, normal, out):
 @njit(**COMPILED)
 def _surface(solids, camera, i, face, t, x, y, local, world, normal):
     """Fills the local and world point and world normal of a hit; returns |cos| of the incidence."""
-    o, m, r = solids.origin[i], solids.matrix[i], solids.rotation[i]
+    o = solids.origin[i]
+    m = solids.matrix[i]
+    r = solids.rotation[i]
     for k in range(3):
         local[k] = o[k] + t * (m[k, 0] * x + m[k, 1] * y + m[k, 2])
     n = outward_normal(solids.kind[i], solids.half[i], face, local[0], local[1], local[2])
@@ -203,13 +224,13 @@ def _surface(solids, camera, i, face, t, x, y, local, world, normal):
 
 
 @njit(**COMPILED)
-def _around(solid, face, row, column, found):
+def _around(traced, row, column, found):
     """Collect the distinct faces (8 solid + face) seen in 3 x 3 pixels; return their number."""
-    rows, columns = solid.shape
+    rows, columns = traced.solid.shape
     count = 0
     for r in range(max(row - 1, 0), min(row + 2, rows)):
         for c in range(max(column - 1, 0), min(column + 2, columns)):
-            key = 8 * solid[r, c] + face[r, c]
+            key = 8 * traced.solid[r, c] + traced.face[r, c]
             known = key < 0
             for k in range(count):
                 known = known or found[k] == key
@@ -223,17 +244,13 @@ def _around(solid, face, row, column, found):
 def _gain(solids, lighting, i, world, normal, out):
     """Factor on the texture of solid i."""
     if solids.emission[i] > 0.0:
-        for k in range(3):
-            out[k] = solids.emission[i]
+        out[:] = solids.emission[i]
     else:
         _light(lighting, world, normal, out)
 
 
 @njit(**COMPILED)
-def shade_rows(
-    solids, textures, lighting, camera, pixel, xs, ys, first, last, depth, solid, face,
-    image, normals,
-):  # fmt: skip
+def shade_rows(solids, textures, lighting, camera, pixel, xs, ys, first, last, traced):
     """Colour and camera-frame normal of rows [first, last) from the hits of ``cast_rows``.
 
     ``pixel`` is the width and height of a pixel on the plane z = 1.
@@ -242,44 +259,55 @@ def shade_rows(
     samples are cast, only against the solids seen in the 3 x 3 pixels around.
     """
     found = np.empty(9, np.int64)
-    local, world, normal = np.empty(3), np.empty(3), np.empty(3)
-    gain, edge_gain, colour = np.empty(3), np.empty(3), np.empty(3)
+    local = np.empty(3)
+    world = np.empty(3)
+    normal = np.empty(3)
+    gain = np.empty(3)
+    edge_gain = np.empty(3)
+    colour = np.empty(3)
     pixel_x, pixel_y = pixel
     for row in range(first, last):
         for column in range(xs.shape[1]):
-            i, f, t = solid[row, column], face[row, column], depth[row, column]
+            i = traced.solid[row, column]
+            f = traced.face[row, column]
+            t = traced.depth[row, column]
             x, y = xs[row, column], ys[row, column]
             if i < 0:
                 continue
             cosine = _surface(solids, camera, i, f, t, x, y, local, world, normal)
             for k in range(3):
-                normals[row, column, k] = (
+                traced.normal[row, column, k] = (
                     camera[0, k] * normal[0] + camera[1, k] * normal[1] + camera[2, k] * normal[2]
                 )
             _gain(solids, lighting, i, world, normal, gain)
             footprint = t * pixel_x / math.sqrt(max(cosine, 0.05))
-            count = _around(solid, face, row, column, found)
+            count = _around(traced, row, column, found)
             if count == 1:
                 _texture_colour(solids, textures, i, f, local, 0.7 * footprint, colour)
                 for k in range(3):
-                    image[row, column, k] = min(colour[k] * gain[k], 255.0)
+                    traced.image[row, column, k] = min(colour[k] * gain[k], 255.0)
                 continue
             for sample in range(4):
                 dx = (0.25 if sample & 1 else -0.25) * pixel_x
                 dy = (0.25 if sample & 2 else -0.25) * pixel_y
-                ts, js, fs = np.inf, i, f
+                ts = np.inf
+                js = i
+                fs = f
                 for k in range(count):
                     tk, fk = _hit_pixel(solids, found[k] >> 3, x + dx, y + dy)
                     if tk < ts:
-                        ts, js, fs = tk, found[k] >> 3, fk
+                        ts = tk
+                        js = found[k] >> 3
+                        fs = fk
                 if ts == np.inf:
-                    ts, dx, dy = t, 0.0, 0.0
+                    ts = t
+                    dx = 0.0
+                    dy = 0.0
                 _surface(solids, camera, js, fs, ts, x + dx, y + dy, local, world, normal)
                 _texture_colour(solids, textures, js, fs, local, 0.5 * footprint, colour)
                 if js == i and fs == f:
-                    for k in range(3):
-                        edge_gain[k] = gain[k]
+                    edge_gain[:] = gain
                 else:
                     _gain(solids, lighting, js, world, normal, edge_gain)
                 for k in range(3):
-                    image[row, column, k] += 0.25 * min(colour[k] * edge_gain[k], 255.0)
+                    traced.image[row, column, k] += 0.25 * min(colour[k] * edge_gain[k], 255.0)

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,9 +13,15 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from geogs.geometry.camera import Camera
 from geogs_synth.camera.radial_camera import RadialCamera
-from geogs_synth.raycast.pixel_kernels import Lighting, Textures, cast_rows, shade_rows
-from geogs_synth.raycast.placement import PlacedScene
-from geogs_synth.raycast.visibility_kernels import visibility_slices
+from geogs_synth.raycast.pixel_kernels import (
+    Lighting,
+    PlacedSolids,
+    Textures,
+    Traced,
+    cast_rows,
+    shade_rows,
+)
+from geogs_synth.raycast.solid_kernels import BoundedSolids, visibility_slices
 from geogs_synth.scene.bodies import Body
 from geogs_synth.scene.builder import SceneBuilder
 from geogs_synth.scene.light_changes import LightChanges
@@ -26,14 +33,11 @@ _MAX_CELLS = 60_000
 """Most cells of the light volume; larger scenes have larger cells."""
 _AMBIENT_REACH = 0.7
 """Metres over which solids darken the ambient light where cells have the smallest size."""
-_SPHERE_SAMPLES = 24
 _SHADOW_MIN_HALF = 0.1
 """Metres; solids smaller than this in every direction cast no shadow where cells have the smallest
 size, since they cost as much as large ones."""
 _ROWS_PLACED = 8
 """Rows of a rolling shutter between which solids move straight over the image."""
-_SKY_RADIUS = 1e5
-_SKY_EMISSION = 0.95
 
 
 @dataclass(frozen=True)
@@ -53,35 +57,58 @@ class RenderedView:
 
 
 @dataclass(frozen=True)
-class _Traced:
-    """Arrays that the kernels fill."""
+class PlacedScene:
+    """The n solids of a scene before p cameras."""
 
-    depth: Float64[np.ndarray, "h w"]
-    solid: Int64[np.ndarray, "h w"]
-    face: Int64[np.ndarray, "h w"]
-    image: Float32[np.ndarray, "h w 3"]
-    normal: Float32[np.ndarray, "h w 3"]
+    scene: Scene
+    T_wc: Float64[np.ndarray, "p 4 4"]
+    rotation: Float64[np.ndarray, "p n 3 3"]
+    """Local to world."""
+    centre: Float64[np.ndarray, "p n 3"]
 
-    @staticmethod
-    def empty(height: int, width: int) -> "_Traced":
-        shape = (height, width)
-        return _Traced(
-            np.full(shape, np.inf),
-            np.full(shape, -1, np.int64),
-            np.zeros(shape, np.int64),
-            np.zeros((*shape, 3), np.float32),
-            np.zeros((*shape, 3), np.float32),
+    def solids(self, camera: int) -> PlacedSolids:
+        """All solids for one of the cameras."""
+        s = self.scene
+        return PlacedSolids(
+            kind=s.solids.kind,
+            half=s.solids.half,
+            rotation=self.rotation[camera],
+            origin=self._origin[camera],
+            matrix=self._matrix[camera],
+            texture=s.face_texture,
+            shift=s.texture_shift,
+            emission=s.emission,
         )
 
-    @property
-    def hits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth, solid and face."""
-        return self.depth, self.solid, self.face
+    def bounds(
+        self, lens: RadialCamera, cameras: list[int], margin: float = 0.0
+    ) -> Int64[np.ndarray, "k n 4"]:
+        """Left, top, right, bottom (exclusive) of the pixels that may see each solid."""
+        T_wc = self.T_wc[cameras]
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+        corners = self.scene.solids.bounding_half[:, None] * signs
+        world = np.einsum("pnij,nkj->pnki", self.rotation[cameras], corners)
+        world += self.centre[cameras][:, :, None]
+        local = (world - T_wc[:, None, None, :3, 3]) @ T_wc[:, None, :3, :3]
+        x, y, z = np.moveaxis(local, -1, 0)
+        near = z < 1e-3
+        plane = local[..., :2] / np.where(near, 1.0, z)[..., None]
+        box = lens.pixel_boxes(plane.min(2), plane.max(2), margin)
+        # A solid that crosses the camera's plane may be in any pixel, unless a side excludes it.
+        box[near.any(2)] = [0, 0, lens.camera.width, lens.camera.height]
+        left, top, right, bottom = lens.view
+        for beyond in (near, x < left * z, x > right * z, y < top * z, y > bottom * z):
+            box[beyond.all(2)] = 0
+        return box
 
-    def take(self, row: int, other: "_Traced", other_row: int) -> None:
-        """Copy a row of another."""
-        self.depth[row], self.solid[row] = other.depth[other_row], other.solid[other_row]
-        self.image[row], self.normal[row] = other.image[other_row], other.normal[other_row]
+    @cached_property
+    def _origin(self) -> Float64[np.ndarray, "p n 3"]:
+        offset = self.T_wc[:, None, :3, 3] - self.centre
+        return np.einsum("pnji,pnj->pni", self.rotation, offset)
+
+    @cached_property
+    def _matrix(self) -> Float64[np.ndarray, "p n 3 3"]:
+        return self.rotation.swapaxes(2, 3) @ self.T_wc[:, None, :3, :3]
 
 
 class Raycaster:
@@ -144,18 +171,19 @@ class Raycaster:
         """
         lens = RadialCamera.of(camera)
         placed = self._place(T_wc[None], np.array([time]))
-        solids, bounds = placed.solids(0), placed.bounds(lens)[0]
-        traced, (xs, ys) = _Traced.empty(lens.camera.height, lens.camera.width), lens.rays
+        solids = placed.solids(0)
+        bounds = placed.bounds(lens, [0])[0]
+        traced = _untraced(lens.camera.height, lens.camera.width)
+        xs, ys = lens.rays
         lighting = self._lighting_at(time)
 
         def cast(first: int, last: int) -> None:
-            cast_rows(solids, bounds, xs, ys, first, last, *traced.hits)
+            cast_rows(solids, bounds, xs, ys, first, last, traced)
 
         def shade(first: int, last: int) -> None:
             shade_rows(
-                solids, self._textures, lighting, T_wc, lens.pixel, xs, ys, first, last,
-                *traced.hits, traced.image, traced.normal,
-            )  # fmt: skip
+                solids, self._textures, lighting, T_wc, lens.pixel, xs, ys, first, last, traced
+            )
 
         self._in_bands(lens.camera.height, cast)
         self._in_bands(lens.camera.height, shade)
@@ -171,35 +199,46 @@ class Raycaster:
 
         Row v is that of :meth:`render` at this pose and time.
         """
-        height, width = lens.camera.height, lens.camera.width
-        traced, (xs, ys) = _Traced.empty(height, width), lens.rays
+        height = lens.camera.height
+        traced = _untraced(height, lens.camera.width)
+        xs, ys = lens.rays
 
         def work(first: int, last: int) -> None:
             placed = self._place(T_wc[first:last], times[first:last])
-            ends = placed.bounds(lens, np.array([0, last - first - 1]), margin=1.0)
+            ends = placed.bounds(lens, [0, -1], margin=1.0)
             # Over a few rows the corners of a solid move straight.
             bounds = np.concatenate([ends[..., :2].min(0), ends[..., 2:].max(0)], 1)
             for row in range(first, last):
                 low, high = max(row - 1, 0), min(row + 2, height)
                 # The rows above and below, seen from this row's pose, show where edges are.
-                around = _Traced.empty(high - low, width)
+                around = _untraced(high - low, lens.camera.width)
                 near = bounds - [0, low, 0, low]
                 rays = xs[low:high], ys[low:high]
                 solids = placed.solids(row - first)
-                cast_rows(solids, near, *rays, 0, high - low, *around.hits)
+                cast_rows(solids, near, *rays, 0, high - low, around)
                 lighting = self._lighting_at(times[row])
+                own = row - low
                 shade_rows(
-                    solids, self._textures, lighting, T_wc[row], lens.pixel, *rays,
-                    row - low, row - low + 1, *around.hits, around.image, around.normal,
-                )  # fmt: skip
-                traced.take(row, around, row - low)
+                    solids,
+                    self._textures,
+                    lighting,
+                    T_wc[row],
+                    lens.pixel,
+                    *rays,
+                    own,
+                    own + 1,
+                    around,
+                )
+                for whole, part in zip(traced, around, strict=True):
+                    whole[row] = part[own]
 
         edges = [*range(0, height, _ROWS_PLACED), height]
         list(self._pool.map(work, edges[:-1], edges[1:]))
         return self._view(traced)
 
-    def _view(self, traced: _Traced) -> RenderedView:
-        depth, solid = traced.depth, traced.solid
+    def _view(self, traced: Traced) -> RenderedView:
+        depth = traced.depth
+        solid = traced.solid
         if self._sky is not None:
             solid[solid == self._sky] = -1
             traced.normal[solid < 0] = 0.0
@@ -216,22 +255,21 @@ class Raycaster:
         self, T_wc: Float64[np.ndarray, "p 4 4"], times: Float64[np.ndarray, "p"]
     ) -> PlacedScene:
         """Poses of all solids for p cameras at p times."""
-        s = self._all
-        rotation, centre = s.solids.rotation[None], s.solids.centre[None]
-        if self._bodies:
-            rotation = np.repeat(rotation, len(times), 0)
-            centre = np.repeat(centre, len(times), 0)
-            for first, body in self.bodies():
-                T_wb, own = body.path(times), slice(first, first + len(body.shape))
-                rotation[:, own] = T_wb[:, None, :3, :3] @ body.shape.solids.rotation
-                centre[:, own] = body.shape.solids.centre @ T_wb[:, :3, :3].transpose(0, 2, 1)
-                centre[:, own] += T_wb[:, None, :3, 3]
-        return PlacedScene(s, T_wc, rotation, centre)
+        rotation = np.repeat(self._all.solids.rotation[None], len(times), 0)
+        centre = np.repeat(self._all.solids.centre[None], len(times), 0)
+        for first, body in self.bodies():
+            T_wb = body.path(times)
+            own = slice(first, first + len(body.shape))
+            rotation[:, own] = T_wb[:, None, :3, :3] @ body.shape.solids.rotation
+            centre[:, own] = body.shape.solids.centre @ T_wb[:, :3, :3].transpose(0, 2, 1)
+            centre[:, own] += T_wb[:, None, :3, 3]
+        return PlacedScene(self._all, T_wc, rotation, centre)
 
     def _compute_lighting(self) -> Lighting:
         s = self.scene
         coarser = max(1.0, float(np.cbrt(s.size.prod() / _MAX_CELLS)) / _VOXEL)
-        voxel, reach = coarser * _VOXEL, coarser * _AMBIENT_REACH
+        voxel = coarser * _VOXEL
+        reach = coarser * _AMBIENT_REACH
         large = s.solids.bounding_half.max(1) > coarser * _SHADOW_MIN_HALF
         opaque = s.solids.at(large & (s.emission == 0))
         lights = np.array([(*light.position, light.radius) for light in s.lights]).reshape(-1, 4)
@@ -239,11 +277,11 @@ class Raycaster:
         nx, ny, nz = np.ceil(s.size / voxel).astype(int)
         volume = np.zeros((nz, ny, nx, 1 + len(lights)), np.float32)
         radius = np.linalg.norm(opaque.bounding_half, axis=1)
-        solids = opaque.kind, opaque.half, opaque.rotation, opaque.centre, radius
-        sphere = _fibonacci_sphere(_SPHERE_SAMPLES)
+        solids = BoundedSolids(opaque.kind, opaque.half, opaque.rotation, opaque.centre, radius)
+        sphere = _fibonacci_sphere(24)
 
         def fill(first: int, last: int) -> None:
-            visibility_slices(*solids, lights, sphere, reach, voxel, first, last, volume)
+            visibility_slices(solids, lights, sphere, reach, voxel, first, last, volume)
 
         self._in_bands(int(nz), fill)
         return Lighting(
@@ -256,13 +294,25 @@ class Raycaster:
         )
 
 
+def _untraced(height: int, width: int) -> Traced:
+    """Arrays for the kernels to fill: nothing is hit yet."""
+    shape = (height, width)
+    return Traced(
+        depth=np.full(shape, np.inf),
+        solid=np.full(shape, -1, np.int64),
+        face=np.zeros(shape, np.int64),
+        image=np.zeros((*shape, 3), np.float32),
+        normal=np.zeros((*shape, 3), np.float32),
+    )
+
+
 def _dome(scene: Scene) -> Scene:
     """The sky as a shining ball around everything."""
     assert scene.sky is not None
     build = SceneBuilder(np.random.default_rng(0))
     texture = build.texture(scene.sky.image)
-    radii = np.full(3, _SKY_RADIUS)
-    build.ellipsoid(scene.size / 2, radii, texture, emission=_SKY_EMISSION)
+    radii = np.full(3, 1e5)  # farther than anything else
+    build.ellipsoid(scene.size / 2, radii, texture, emission=0.95)
     return build.build(scene.size)
 
 

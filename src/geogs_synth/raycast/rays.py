@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs_synth.raycast.solid_kernels import closest_hits
+from geogs_synth.raycast.solid_kernels import BoundedSolids, closest_hits
 from geogs_synth.scene.solids import SolidBatch
 
 _TINY = 1e-9
@@ -27,9 +27,11 @@ class Hit:
 
 
 def closest_hit(
-    size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
+    size: Float[Tensor, "b 3"],
+    solids: SolidBatch,
+    origin: Float[Tensor, "b m 3"],
     direction: Float[Tensor, "b m 3"],
-) -> Hit:  # fmt: skip
+) -> Hit:
     """First hit of each ray from inside a room."""
     d = torch.where(direction.abs() < _TINY, _TINY, direction)
     leaves = (torch.where(d > 0, size[:, None] - origin, -origin) / d).amin(-1)
@@ -37,26 +39,29 @@ def closest_hit(
 
 
 def occluded(
-    solids: SolidBatch, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
+    solids: SolidBatch,
+    origin: Float[Tensor, "b m 3"],
+    direction: Float[Tensor, "b m 3"],
     end: Float[Tensor, "b m"],
-) -> Bool[Tensor, "b m"]:  # fmt: skip
+) -> Bool[Tensor, "b m"]:
     """Whether a solid is hit before ``t = end``."""
     return _first(solids, origin, direction, end).solid >= 0
 
 
 def _first(
-    solids: SolidBatch, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
+    solids: SolidBatch,
+    origin: Float[Tensor, "b m 3"],
+    direction: Float[Tensor, "b m 3"],
     end: Float[Tensor, "b m"],
-) -> Hit:  # fmt: skip
+) -> Hit:
     """First hit with a solid before ``end``, or -1 there."""
-    t, solid = end.double().clone(), torch.full(end.shape, -1)
+    t = end.double().clone()
+    solid = torch.full(end.shape, -1)
     radius = solids.bounding_half.norm(dim=-1)
     numbers = (solids.half, solids.rotation, solids.centre, radius, origin, direction)
-    half, rotation, centre, around, start, ray = (x.double().contiguous().numpy() for x in numbers)
+    *shapes, start, ray = (x.double().contiguous().numpy() for x in numbers)
     kind = solids.kind.contiguous().numpy()
     for k in range(len(t)):
-        closest_hits(
-            kind[k], half[k], rotation[k], centre[k], around[k], start[k], ray[k], t[k].numpy(),
-            solid[k].numpy(),
-        )  # fmt: skip
+        bounded = BoundedSolids(kind[k], *(x[k] for x in shapes))
+        closest_hits(bounded, start[k], ray[k], t[k].numpy(), solid[k].numpy())
     return Hit(t.to(origin), solid)

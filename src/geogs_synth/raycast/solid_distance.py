@@ -36,7 +36,8 @@ def wall_distance(
 
 def _places(solids: SolidBatch, kind: int) -> Int[Tensor, "k"]:
     """Slots in which some room has a solid of a kind; all slots on a GPU."""
-    n, device = solids.kind.shape[1], solids.kind.device
+    n = solids.kind.shape[1]
+    device = solids.kind.device
     if device.type != "cpu":  # to know how many there are, the host would have to wait
         return torch.arange(n, device=device)
     return (solids.kind == kind).any(0).nonzero()[:, 0]

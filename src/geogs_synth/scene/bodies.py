@@ -29,6 +29,7 @@ def upright_poses(
     """Body to world for bodies that stand upright, by the cosine and sine of their yaw."""
     T_wb = np.tile(np.eye(4), (len(position), 1, 1))
     T_wb[:, 0, 0] = T_wb[:, 1, 1] = cosine
-    T_wb[:, 1, 0], T_wb[:, 0, 1] = sine, -sine
+    T_wb[:, 1, 0] = sine
+    T_wb[:, 0, 1] = -sine
     T_wb[:, :3, 3] = position
     return T_wb

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -27,18 +27,6 @@ def yaw_rotation(yaw: Number) -> Float64[np.ndarray, "3 3"]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-class _Solid(NamedTuple):
-    """One entry of the arrays of a scene."""
-
-    kind: int
-    rotation: np.ndarray
-    centre: np.ndarray
-    half: np.ndarray
-    face_texture: list[int]
-    texture_shift: np.ndarray
-    emission: Number
-
-
 class SceneBuilder:
     """Collects solids given in a local frame; ``at`` opens a frame inside this one.
 
@@ -46,7 +34,7 @@ class SceneBuilder:
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._solids: list[_Solid] = []
+        self._solids: list[tuple[Any, ...]] = []
         self._textures: list[Texture] = []
         self._lights: list[Light] = []
         self._rng = rng
@@ -116,12 +104,7 @@ class SceneBuilder:
         kind, rotation, centre, half, faces, shift, emission = zip(*self._solids, strict=True)
         return Scene(
             size=np.asarray(size, float),
-            solids=Solids(
-                np.array(kind, np.int64),
-                np.array(rotation, float),
-                np.array(centre, float),
-                np.array(half, float),
-            ),
+            solids=Solids(np.array(kind), np.array(rotation), np.array(centre), np.array(half)),
             face_texture=np.array(faces, np.int64),
             texture_shift=np.array(shift, float),
             emission=np.array(emission, float),
@@ -143,4 +126,4 @@ class SceneBuilder:
         shift = self._rng.uniform(0.0, 4.0, 2)
         place = self._origin + self._rotation @ np.asarray(centre, float)
         turned = self._rotation @ local
-        self._solids.append(_Solid(kind, turned, place, half, faces, shift, emission))
+        self._solids.append((kind, turned, place, half, faces, shift, emission))

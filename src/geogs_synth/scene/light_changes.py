@@ -5,9 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-_OFF, _BRIGHT = 0.0, 2.0
-"""Gains of a lamp that is off, and of one that is brighter instead."""
-
 
 @dataclass(frozen=True)
 class LightChanges:
@@ -20,11 +17,8 @@ class LightChanges:
 
 
 def switched_by_thirds(lights: int, seconds: float) -> LightChanges:
-    """Three lightings: all lights as they are; every other one off and the rest bright; and the
-    reverse."""
+    """Three lightings: all lights as they are; every other one off and the rest twice as bright;
+    and the reverse."""
     is_even = np.arange(lights) % 2 == 0
-    first = np.where(is_even, _OFF, _BRIGHT)
-    second = np.where(is_even, _BRIGHT, _OFF)
-    return LightChanges(
-        np.array([1.0, 2.0]) * seconds / 3, np.stack([np.ones(lights), first, second])
-    )
+    gains = np.stack([np.ones(lights), 2.0 * ~is_even, 2.0 * is_even])
+    return LightChanges(np.array([1.0, 2.0]) * seconds / 3, gains)

@@ -1,7 +1,7 @@
 """Location of a sequence: the scene, the camera's intrinsics and units that suit its size."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -9,10 +9,9 @@ from geogs_synth.motion.motion_kinds import MotionKind
 from geogs_synth.motion.room_motions import Motion, room_motion
 from geogs_synth.places.corridor import make_corridor, walk
 from geogs_synth.places.dining_room import make_dining_room
+from geogs_synth.places.moving_bodies import crossing_walkers, street_traffic
 from geogs_synth.places.room import make_room
 from geogs_synth.places.street import drive, make_street
-from geogs_synth.places.traffic import street_traffic
-from geogs_synth.places.walkers import crossing_walkers
 from geogs_synth.scene.bodies import Body
 from geogs_synth.scene.textured_scene import Scene
 
@@ -29,21 +28,26 @@ class Location:
     """A scene and a camera motion through it."""
 
     kind: MotionKind
-    name: str
     seed: int
     scene: Scene
     motion: Motion
-    width: int
-    height: int
+    width: int = 320
+    height: int = 240
     """Default height of the images, pixels."""
-    focal: float
+    focal: float = ROOM_FOCAL
     """Focal length over the longer side of the image: a phone held upright has the same lens."""
-    depth_scale: float
+    depth_scale: float = 6553.5
     """Units of the depth images per metre."""
-    voxel_cm: int
+    voxel_cm: int = 1
     """Voxel size of the seen points, one point to a voxel, centimetres."""
-    reach: float
+    reach: float = math.inf
     """Largest depth that counts as seen, metres."""
+
+    @property
+    def name(self) -> str:
+        """The place and its seed."""
+        places = {"driving": "street", "corridor": "corridor", "dining": "dining room"}
+        return f"procedural {places.get(self.kind, 'room')}, seed {self.seed}"
 
     def camera(self, width: int | None, height: int | None) -> Camera:
         """A camera of this or the default size, its principal point in the middle of the image."""
@@ -63,21 +67,15 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
     """
     scene = scene or make_scene(kind, seed)
     if kind == "driving":
-        return Location(
-            kind, f"procedural street, seed {seed}", seed, scene, drive(seed),
-            width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
-        )  # fmt: skip
+        street = Location(
+            kind, seed, scene, drive(seed), width=1241, height=376, focal=STREET_FOCAL
+        )
+        return replace(street, depth_scale=256.0, voxel_cm=10, reach=40.0)
     if kind == "corridor":
-        return Location(
-            kind, f"procedural corridor, seed {seed}", seed, scene, walk(scene, seed),
-            width=320, height=240, focal=ROOM_FOCAL, depth_scale=2000.0, voxel_cm=2, reach=15.0,
-        )  # fmt: skip
+        motion = walk(scene, seed)
+        return Location(kind, seed, scene, motion, depth_scale=2000.0, voxel_cm=2, reach=15.0)
     motion = room_motion("handheld" if kind == "dining" else kind, scene, seed)
-    room = "dining room" if kind == "dining" else "room"
-    return Location(
-        kind, f"procedural {room}, seed {seed}", seed, scene, motion,
-        width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
-    )  # fmt: skip
+    return Location(kind, seed, scene, motion)
 
 
 def make_scene(kind: MotionKind, seed: int = 0) -> Scene:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from geogs_synth.camera.flaws import Flaws
-from geogs_synth.camera.image_sensor import Sensor
-from geogs_synth.camera.moving_lens import MovingLens
-from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.camera.radial_camera import MovingLens, RadialCamera
+from geogs_synth.camera.sensors import ImageSensor
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.bodies import Body, Path
 
@@ -57,7 +56,7 @@ class Shooting:
         self._path = path
         self._flaws = flaws
         self._rate = rate
-        self._sensor = Sensor(flaws, lens.camera, seed)
+        self._sensor = ImageSensor(flaws, lens.camera, seed)
         self._moving_lens = MovingLens(lens, flaws, seed)
 
     def shoot(self, index: int) -> Shot:
@@ -115,7 +114,8 @@ class Shooting:
         step = max(1, self.lens.camera.width // _GRID)
         some = slice(step // 2, None, step)
         x, y = (axis[some, some].ravel() for axis in self.lens.rays)
-        depth, solid = truth.depth[some, some].ravel(), truth.solid[some, some].ravel()
+        depth = truth.depth[some, some].ravel()
+        solid = truth.solid[some, some].ravel()
         # The sky is farther than anything else.
         depth = np.where(depth > 0, depth, 1e4)
         points = np.stack([x, y, np.ones_like(x)], 1) * depth[:, None]

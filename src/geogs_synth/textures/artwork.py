@@ -56,7 +56,8 @@ def poster(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray
                 corners = np.array([x, y]) + rng.uniform(-1.5 * size, 1.5 * size, (3, 2))
                 cv2.fillPoly(image, [corners.astype(np.int32)], shade, cv2.LINE_AA)
     image[int(0.72 * h) :] = rng.uniform(190, 245, 3)
-    left, width = int(0.07 * w), int(0.86 * w)
+    left = int(0.07 * w)
+    width = int(0.86 * w)
     _write_line(rng, image, left, int(0.82 * h), width, h // 14)
     for k in range(4):
         _write_line(rng, image, left, int((0.87 + 0.032 * k) * h), width, h // 45)

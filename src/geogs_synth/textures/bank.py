@@ -116,7 +116,8 @@ def _timber(rng: np.random.Generator) -> Colour:
 
 def _books(rng: np.random.Generator, size: int) -> UInt8[np.ndarray, "s s 3"]:
     """Rows of book spines."""
-    rows, across = int(rng.integers(1, 4)), int(rng.integers(5, 11))
+    rows = int(rng.integers(1, 4))
+    across = int(rng.integers(5, 11))
     shape = (max(48, size // rows), max(12, size // across))
     lines = [
         np.concatenate([artwork.book_spine(rng, shape) for _ in range(across)], 1)
@@ -127,7 +128,8 @@ def _books(rng: np.random.Generator, size: int) -> UInt8[np.ndarray, "s s 3"]:
 
 def _noise(rng: np.random.Generator, size: int) -> UInt8[np.ndarray, "s s 3"]:
     """Clouds, speckles or blotches of two colours, from one scale or many."""
-    cells, gain = np.exp(rng.uniform(0.7, np.log(size / 4))), rng.uniform(0.45, 1.0)
+    cells = np.exp(rng.uniform(0.7, np.log(size / 4)))
+    gain = rng.uniform(0.45, 1.0)
     stretch = np.exp(rng.uniform(-1.5, 1.5)) if rng.random() < 0.4 else 1.0
     lattice = (max(1.0, cells * stretch), max(1.0, cells / stretch))
     value = patterns.fractal_noise(rng, (size, size), lattice, int(rng.integers(1, 8)), gain)

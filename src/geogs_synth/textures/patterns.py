@@ -148,7 +148,8 @@ def _flower(
     radius: float,
     colour: np.ndarray,
 ) -> None:
-    petals, turn = int(rng.integers(4, 8)), rng.uniform(0, math.pi)
+    petals = int(rng.integers(4, 8))
+    turn = rng.uniform(0, math.pi)
     shade = tuple(float(c) for c in np.clip(colour * rng.uniform(0.8, 1.25, 3), 0, 255))
     for k in range(petals):
         a = turn + 2 * math.pi * k / petals
@@ -239,7 +240,8 @@ def fabric(
     image = np.broadcast_to(np.asarray(colour, np.float32), (h, w, 3)).copy()
     for axis, length in ((y, h), (x, w)):
         for _ in range(3):
-            start, width = rng.uniform(0, 0.8), rng.uniform(0.02, 0.12)
+            start = rng.uniform(0, 0.8)
+            width = rng.uniform(0.02, 0.12)
             inside = (axis / length > start) & (axis / length < start + width)
             image[inside] = 0.55 * image[inside] + 0.45 * np.asarray(stripe, np.float32)
     slub = fractal_noise(rng, shape, (24, 24), 4, 0.9)
@@ -260,7 +262,8 @@ def rug(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "
     pitch = h / 14
     for r in range(14):
         for c in range(round(w / pitch)):
-            size, turn = pitch * rng.uniform(0.2, 0.42), rng.uniform(-10, 10) + 45 * (r % 2)
+            size = pitch * rng.uniform(0.2, 0.42)
+            turn = rng.uniform(-10, 10) + 45 * (r % 2)
             box = cv2.boxPoints((((c + 0.5) * pitch, (r + 0.5) * pitch), (size, size), turn))
             shade = tuple(map(float, colours[rng.integers(7)]))
             cv2.fillPoly(image, [box.astype(np.int32)], shade, cv2.LINE_AA)
@@ -280,7 +283,8 @@ def ceramic(
     image = _tint(fractal_noise(rng, shape, (4, 8), 6, 0.7), colour, 0.09)
     h, w = shape
     for _ in range(5):
-        top, shade = rng.uniform(0.05, 0.9), random_colour(rng, (0.1, 0.6), (0.3, 0.9))
+        top = rng.uniform(0.05, 0.9)
+        shade = random_colour(rng, (0.1, 0.6), (0.3, 0.9))
         band = slice(int(top * h), int((top + rng.uniform(0.02, 0.07)) * h))
         image[band] *= np.asarray(shade, np.float32) / 170
     for _ in range(70):

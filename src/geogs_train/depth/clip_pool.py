@@ -8,6 +8,7 @@ from torch import Tensor
 
 from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.scene.batch import map_tensors
 from geogs_train.ahead import PlansAhead
 from geogs_train.course import Worker
 
@@ -43,29 +44,25 @@ class StoredClips:
             coarse.quantile(levels, -1).movedim(0, -1),
         )
 
-    def tensors(self) -> list[Tensor]:
-        """Tensors in the order of the fields."""
-        return [*vars(self).values()]
-
 
 class ClipPool:
     """Pool that holds at turn t the batches t to t + ``plans`` - 1 of an endless supply."""
 
     def __init__(self, rooms: RoomSampler, plans: int, clips: int, worker: Worker) -> None:
         """``clips`` is the number of clips in a batch."""
-        self._rooms, self._plans, self._clips = rooms, plans, clips
+        self._rooms = rooms
+        self._plans = plans
+        self._clips = clips
         self._ahead = PlansAhead(rooms, clips, worker)
         self._stored: StoredClips | None = None
         self._turn = 0
 
     def at(self, turn: int) -> StoredClips:
         """The clips of a turn; missing batches are rendered and replace the oldest."""
-        if self._stored is None or not self._turn <= turn <= self._turn + self._plans:
-            self._stored, self._turn = None, turn
-            missing = range(turn, turn + self._plans)
-        else:
-            missing = range(self._turn + self._plans, turn + self._plans)
-        for number in missing:
+        first = self._turn + self._plans
+        if self._stored is None or not self._turn <= turn <= first:
+            first = turn
+        for number in range(first, turn + self._plans):
             self._put(number, StoredClips.of(self._rooms.film(self._ahead.plan(number))))
         self._turn = turn
         assert self._stored is not None
@@ -82,8 +79,8 @@ class ClipPool:
 
     def _put(self, number: int, clips: StoredClips) -> None:
         if self._stored is None:
-            empty = (x.new_empty(self._plans * self._clips, *x.shape[1:]) for x in clips.tensors())
-            self._stored = StoredClips(*empty)
+            shape = (self._plans * self._clips,)
+            self._stored = map_tensors(lambda x: x.new_empty(shape + x.shape[1:]), clips)
         start = number % self._plans * self._clips
-        for kept, new in zip(self._stored.tensors(), clips.tensors(), strict=True):
+        for kept, new in zip(vars(self._stored).values(), vars(clips).values(), strict=True):
             kept[start : start + self._clips] = new

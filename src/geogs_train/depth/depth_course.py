@@ -10,15 +10,13 @@ from torch import Tensor
 from geogs.depth.network.model import DepthNetwork, load_depth_network
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
-from geogs_train.course import Panels, Worker
+from geogs_train.course import Panels, Worker, write_weights
 from geogs_train.depth.clip_pool import ClipPool
-from geogs_train.depth.confidence_fit import calibrated
 from geogs_train.depth.depth_loss import depth_loss
 from geogs_train.depth.depth_options import DepthTraining
-from geogs_train.depth.depth_scores import DepthErrors, DepthScores
+from geogs_train.depth.depth_scores import DepthErrors, DepthScores, calibrated
 from geogs_train.depth.depth_tuples import DepthBatch, draw_tuples
 from geogs_train.depth.depth_validation import DepthValidation
-from geogs_train.trained_weights import write_weights
 
 CALIBRATION_BATCHES, CALIBRATION_SEED = 6, 9
 
@@ -39,7 +37,8 @@ class DepthCourse:
     recordable = False
 
     def __init__(self, options: DepthTraining, worker: Worker) -> None:
-        self.options, self.worker = options, worker
+        self.options = options
+        self.worker = worker
         large = RoomSampler(options.rooms, worker.device, options.seed)
         small = RoomSampler(
             replace(options.rooms, width=options.small_width, height=options.small_height),
@@ -70,7 +69,8 @@ class DepthCourse:
             self._pools[True].empty()
         clips = self._pools[small].at(step // options.pool.refresh)
         shared = Draw.keyed(torch.device("cpu"), options.seed, step)
-        least, most = options.tuples.least_neighbours, options.tuples.most_neighbours
+        least = options.tuples.least_neighbours
+        most = options.tuples.most_neighbours
         count = least + int(shared.integers(most - least + 1, 1))
         draw = Draw(self.worker.generator(options.seed, step))
         size = options.small_batch if small else options.batch

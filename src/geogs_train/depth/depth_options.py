@@ -11,46 +11,46 @@ from geogs_train.training_options import TrainingSchedule
 
 @dataclass(frozen=True)
 class PoolOptions(Settings, group="training.pool"):
-    """Clips that are kept on the device; each step draws its keyframes from them."""
+    """The pool of clips kept on the device, from which each step draws its keyframes."""
 
     plans: Count = 64
-    """Batches of rooms that are there at once."""
+    """Number of batches of clips in the pool."""
     rooms: Count = 16
-    """Rooms of a batch, a clip each."""
+    """Number of clips in a batch, each of another room."""
     refresh: Count = 4
-    """Steps after which another batch takes the place of the oldest."""
+    """Steps after which a new batch replaces the oldest."""
 
 
 @dataclass(frozen=True)
 class TupleOptions(Settings, group="training.tuples"):
-    """Which views make a sample, and what is wrong with what is known of them."""
+    """Choice of the views of a sample, and the errors of their poses, lens, light and depths."""
 
     least_neighbours: Annotated[int, Range(1, 16)] = 3
-    """Fewest neighbours; their number is that of a whole batch."""
+    """Least number of neighbours of a keyframe; all keyframes of a batch have as many."""
     most_neighbours: Annotated[int, Range("least_neighbours", 16)] = 8
-    """Most neighbours."""
+    """Largest number of neighbours of a keyframe."""
     least_baseline: Positive = 0.015
-    """Baseline over the median depth from which on a view is a good neighbour."""
+    """Least baseline of a good neighbour, over the median depth."""
     most_baseline: Annotated[float, Range(above="least_baseline", most=10)] = 0.5
-    """Baseline over the median depth up to which it is."""
+    """Largest baseline of a good neighbour, over the median depth."""
     dud: Fraction = 0.05
     """Fraction of the neighbours that show another room."""
     missing: Fraction = 0.05
-    """Fraction of the neighbours that are not there."""
+    """Fraction of the neighbours that are missing."""
     disturbed: Fraction = 0.5
-    """Fraction of the keyframes whose neighbours' poses are wrong."""
+    """Fraction of the keyframes whose neighbours' poses are wrong; as many have a wrong lens."""
     rotation: tuple[Annotated[float, Range(0, 10)], ...] = (0.02, 0.3)
-    """Range of the deviation of a wrong pose's rotation about each axis, degrees."""
+    """Range of the standard deviation of the rotation error about each axis, degrees."""
     translation: tuple[Annotated[float, Range(0, 1)], ...] = (0.003, 0.05)
-    """Range of the deviation of its translation along each axis, over the baseline."""
+    """Range of the standard deviation of the translation error per axis, over the baseline."""
     focal: Fraction = 0.01
-    """Largest relative error of the focal length, in as many."""
+    """Largest relative error of a wrong focal length."""
     photometric: Weight = 0.5
-    """Strength of what each view's light and colours are changed by, beside the camera's flaws."""
+    """Strength of the changes of exposure, colour and noise of a view, on top of the camera's."""
     typical_error: tuple[Positive, ...] = (0.75, 1.35)
-    """Range of the factor on the median depth that is known."""
+    """Range of the factor by which the given median depth is wrong."""
     range_error: tuple[Positive, ...] = (0.7, 1.6)
-    """Range of the factors by which either end of the search lies beyond what it should be."""
+    """Range of the factor by which either end of the search range is too far out."""
 
 
 @dataclass(frozen=True)
@@ -58,42 +58,42 @@ class DepthLossOptions(Settings, group="training.loss"):
     """Weights of the parts of the loss."""
 
     edges: Weight = 2.0
-    """How much more the pixels near jumps of depth count."""
+    """Additional weight of pixels near depth discontinuities."""
     choice: Weight = 0.1
-    """Weight of the cross-entropy of the depths that are tried near what the planes say."""
+    """Weight of the cross-entropy of the depths tried in the fine search at 1/2."""
     gradient: Weight = 0.5
-    """Weight of differences of log depth at four scales."""
+    """Weight of the errors of log-depth differences at four scales."""
     bent: Weight = 0.5
-    """Weight of the normals of depth."""
+    """Weight of the normals that follow from the estimated depth."""
     normal: Weight = 0.5
-    """Weight of the angle between normals, radians."""
+    """Weight of the angle between estimated and true normals, radians."""
     spread: Weight = 0.05
-    """Weight of the normals' likelihood, which only their concentration learns from."""
+    """Weight of the likelihood of the normals, which trains their concentration only."""
     planes: Weight = 0.2
-    """Weight of the cross-entropy of the planes."""
+    """Weight of the cross-entropy of the final scores of the planes."""
     scores: Weight = 0.1
-    """Weight of the same of the scores before the keyframe's context joins them."""
+    """Weight of the cross-entropy of the planes' scores before the keyframe's context is added."""
     likelihood: Weight = 0.1
-    """Weight of the likelihood of depth, which only deviation and outliers learn from."""
+    """Weight of the likelihood of depth, which trains its deviation and outliers only."""
     agreement: Weight = 0.1
-    """Weight of what normals and normals of depth differ by."""
+    """Weight of the difference between the estimated normals and those of the estimated depth."""
     late: Fraction = 0.05
-    """Fraction of the run after which the likelihoods count."""
+    """Fraction of the run before the likelihoods count."""
 
 
 @dataclass(frozen=True)
 class DepthTraining(TrainingSchedule):
-    """What a training run of the depth network does."""
+    """Settings of the training of the depth network."""
 
     steps: Annotated[int, Range(1)] = 12_000
     learning_rate: Positive = 6e-4
     weight_decay: Weight = 1e-2
     batch: Count = 12
-    """Keyframes per step and device."""
+    """Number of keyframes per step and device."""
     small_batch: Count = 24
-    """The same in the steps with small images."""
+    """Number of keyframes per step and device while images are small."""
     small: Fraction = 0.6
-    """Fraction of the run, its first, with small images."""
+    """Fraction of the run, at its start, with small images."""
     rooms: RoomOptions = field(
         default_factory=lambda: RoomOptions(
             width=512,
@@ -106,7 +106,7 @@ class DepthTraining(TrainingSchedule):
             motions=MotionWeights(0.3, 0.35, 0.12, 0.05, 0.18),
         )
     )
-    """What the clips show."""
+    """The rooms and the clips filmed in them."""
     small_width: Annotated[int, Range(16, 8192)] = 320
     """Width of the small images, pixels."""
     small_height: Annotated[int, Range(16, 8192)] = 224

@@ -3,14 +3,18 @@
 from dataclasses import asdict, dataclass
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
+
+from geogs.depth.network.depth_calibration import TOLERANCE, DepthCalibration, right_logit
 
 FAINT, TEXTURED = 0.4, 2.0
 """Gradients of the undisturbed picture in 8-bit levels per pixel, root mean square over 9 x 9
 pixels: below the first a surface is bare, above the second textured, between them faint."""
 KINDS = ("textured", "faint", "bare")
+BELIEVED = 0.5
+"""Probability of an outlier below which a depth is accepted."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class DepthScores:
 def summarise(pixels: DepthErrors) -> DepthScores:
     """Scores of all pixels."""
     relative = pixels.error.exp().sub(1).abs()
-    believed = pixels.outlier < 0.5
+    believed = pixels.outlier < BELIEVED
     inside = pixels.error.abs() < 2 * pixels.deviation
     sure = believed & (pixels.deviation < 0.03)
     parts = {}
@@ -125,3 +129,42 @@ def _mean(values: Tensor) -> float:
 
 def _median(values: Tensor) -> float:
     return float(values.median()) if len(values) else float("nan")
+
+
+def calibrated(pixels: DepthErrors) -> DepthCalibration:
+    """Fit the calibration to pixels of rooms that the network was not trained on.
+
+    Scales are multiplied so that as many errors lie within two standard deviations as of a Laplace
+    distribution; the probability to be right is fitted by logistic regression.
+    """
+    scale = pixels.deviation / 2**0.5
+    ratio = (pixels.error.abs() / scale)[pixels.outlier < BELIEVED]
+    two = 2 * 2**0.5
+    fraction = float(1 - torch.tensor(-two).exp())
+    factor = 1.0
+    if len(ratio):
+        # The quantile; torch.quantile limits the number of values.
+        rank = min(int(fraction * len(ratio)), len(ratio) - 1)
+        factor = float(ratio.sort().values[rank]) / two
+    right = pixels.error.abs() < TOLERANCE
+    logit = right_logit(scale.log(), torch.logit(pixels.outlier, 1e-6))
+    gain, offset = logistic_fit(logit.double(), right)
+    return DepthCalibration(factor, gain, offset)
+
+
+def logistic_fit(x: Float[Tensor, "n"], right: Bool[Tensor, "n"]) -> tuple[float, float]:
+    """Maximum-likelihood gain and offset of the logit, by Newton's method.
+
+    The likelihood is no sum of squares, so the least-squares loop cannot be used.
+    """
+    X = torch.stack([x, torch.ones_like(x)], 1)
+    w = X.new_tensor([1.0, 0.0])
+    ridge = 1e-3 * len(X) * torch.eye(2, dtype=X.dtype, device=X.device)
+    start = w.clone()
+    for _ in range(50):
+        p = (X @ w).sigmoid()
+        slope = X.T @ (p - right.to(X)) + ridge @ (w - start)
+        curvature = (X * (p * (1 - p))[:, None]).T @ X + ridge
+        step = torch.linalg.solve(curvature, slope)
+        w = w - step.clamp(-1, 1)
+    return float(w[0]), float(w[1])

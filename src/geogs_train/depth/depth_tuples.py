@@ -39,7 +39,8 @@ def draw_tuples(
 ) -> DepthBatch:
     """Draw and disturb ``count`` keyframes with ``neighbours`` each."""
     total, views = clips.depth.shape[:2]
-    clip, view = draw.integers(total, count), draw.integers(views, count)
+    clip = draw.integers(total, count)
+    view = draw.integers(views, count)
     others = choose_neighbours(clips, clip, view, neighbours, options, draw)
     T = clips.T_cw[clip]
     own = T[torch.arange(count, device=draw.device), view]
@@ -58,16 +59,9 @@ def draw_tuples(
     lens = torch.cat([lens[:, :2] * factor[:, None], lens[:, 2:]], 1)
     images = torch.cat([clips.images[clip, view][:, None], clips.images[shown, others]], 1)
     images = relit(images.float() / 255, options.photometric, draw)
+    lenses = lens[:, None].expand(-1, neighbours, -1)
     known = StereoViews(
-        images[:, 0],
-        images[:, 1:],
-        lens,
-        lens[:, None].expand(-1, neighbours, -1),
-        relative,
-        valid,
-        near,
-        far,
-        typical,
+        images[:, 0], images[:, 1:], lens, lenses, relative, valid, near, far, typical
     )
     place = torch.stack([clip, view], 1)
     return DepthBatch(known, clips.depth[clip, view], clips.normal[clip, view].float(), place)

@@ -34,7 +34,8 @@ class DepthValidation:
     ) -> None:
         """``bank`` may be that of another set."""
         rooms = RoomSampler(replace(options.rooms, validation=True), device, seed, bank)
-        self.options, self.bank = options, rooms.bank
+        self.options = options
+        self.bank = rooms.bank
         draw = Draw(torch.Generator(device).manual_seed(seed))
         self.batches: list[DepthBatch] = []
         self.kinds: list[UInt8[Tensor, "b h w"]] = []
@@ -53,9 +54,9 @@ class DepthValidation:
     def errors(self, network: DepthNetwork) -> list[DepthErrors]:
         """Errors of a network, batch by batch."""
         network.eval()
-        found = (network(b.views) for b in self.batches)
         parts = [
-            pixel_errors(b, f, k) for b, f, k in zip(self.batches, found, self.kinds, strict=True)
+            pixel_errors(batch, network(batch.views), kind)
+            for batch, kind in zip(self.batches, self.kinds, strict=True)
         ]
         network.train()
         return parts

@@ -10,13 +10,12 @@ from geogs.tracking.flow.own_network import FlowNetwork, load_flow_network
 from geogs_synth.clips.room_options import SCENE_KINDS
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.ahead import PlansAhead
-from geogs_train.course import Panels, Worker
+from geogs_train.course import Panels, Worker, write_weights
 from geogs_train.flow.flow_loss import flow_loss, run_network
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
 from geogs_train.flow.flow_validation import SceneScores, SceneValidation
 from geogs_train.flow.starts import StartOptions
-from geogs_train.trained_weights import write_weights
 
 LEAST_PROCESSES = 3
 """Fewest processes that draw plans for a GPU: a step of this network is short."""
@@ -46,7 +45,8 @@ class FlowCourse:
     )
 
     def __init__(self, options: FlowTraining, worker: Worker) -> None:
-        self.options, self.worker = options, worker
+        self.options = options
+        self.worker = worker
         self.rooms = RoomSampler(options.rooms, worker.device, options.seed)
         self._plans = PlansAhead(self.rooms, options.batch, worker, LEAST_PROCESSES)
 

@@ -42,7 +42,8 @@ def flow_loss(
     A cell's flow and its uncertainty are trained by the negative log-likelihood of the error, and
     by a little of its size, which keeps hopeless cells learning.
     """
-    truth, weight = batch.at_cells(batch.truth), _weights(batch, options)
+    truth = batch.at_cells(batch.truth)
+    weight = torch.where(batch.visible, 1.0, options.occluded) * batch.known
     at_cells = batch.at_cells(weight)
     total = truth.new_zeros(())
     for n, estimate in enumerate(estimates):
@@ -76,10 +77,6 @@ def descriptor_loss(features: FlowFeatures, batch: FlowBatch) -> Float[Tensor, "
         target = (portion[..., 1, :, None] * portion[..., 0, None, :]).flatten(-2)
         total = total + _mean(-(target * windows[..., n, :]).sum(-1), inside.float())
     return total
-
-
-def _weights(batch: FlowBatch, options: FlowTraining) -> Float[Tensor, "e h w"]:
-    return torch.where(batch.visible, 1.0, options.occluded) * batch.known
 
 
 def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, ""]:

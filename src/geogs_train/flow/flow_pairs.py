@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.lookup import Edges
-from geogs.tracking.flow.own_network import cell_pixels
+from geogs.tracking.flow.network_parts import cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import PAPERED
@@ -79,7 +79,8 @@ def _offsets(like: Float[Tensor, "e p 2"], generator: torch.Generator) -> Float[
     """Offsets of any direction with log-uniform lengths."""
     u = torch.rand(*like.shape, generator=generator, device=like.device)
     low, high = math.log(PROBE[0]), math.log(PROBE[1])
-    length, angle = (low + (high - low) * u[..., 0]).exp(), 2 * math.pi * u[..., 1]
+    length = (low + (high - low) * u[..., 0]).exp()
+    angle = 2 * math.pi * u[..., 1]
     return length[..., None] * torch.stack([angle.cos(), angle.sin()], -1)
 
 
@@ -94,7 +95,8 @@ def _starts(
     options: StartOptions,
     generator: torch.Generator,
 ) -> Tensor:
-    largest, truth = None, _at_cells(truth)
+    largest = None
+    truth = _at_cells(truth)
     if clips.dynamics is not None:
         # A tracker's poses and depths predict the camera's motion only.
         truth = clips.still_flow(_at_cells(clips.points(pair[0])), pair[1])
@@ -103,7 +105,8 @@ def _starts(
     depth = _at_cells(clips.depth[:, pair[0]])
     cells = cell_pixels(depth.shape[1], depth.shape[2], depth).reshape(*depth.shape[1:], 2)
     intrinsics = clips.views.intrinsics.float()
-    f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]
+    f = intrinsics[:, None, None, :2]
+    c = intrinsics[:, None, None, 2:]
     rays = torch.cat([(cells - c) / f, torch.ones_like(depth)[..., None]], -1)
     T_cw = clips.views.T_cw.float()
     T_ji = T_cw[:, pair[1]] @ se3_inverse(T_cw[:, pair[0]])

@@ -45,7 +45,8 @@ def disturbed_starts(
     points of the first view to the second. ``largest`` is each edge's largest mean disturbance,
     if it is not that of the options.
     """
-    n, device = len(truth), truth.device
+    n = len(truth)
+    device = truth.device
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(n, *shape, generator=generator, device=device)
@@ -78,10 +79,12 @@ def disturbed_starts(
     rotation = normal(3) * (0.5 * amount / focal)[:, None]
     shift = normal(3) * (0.5 * amount / focal / middle.clamp(min=1e-3))[:, None]
     T = se3_exp(torch.cat([shift, rotation], -1)) @ T_ji
-    R, t = T[:, None, None, :3, :3], T[:, None, None, :3, 3]
+    R = T[:, None, None, :3, :3]
+    t = T[:, None, None, :3, 3]
     y = (R @ rays[..., None])[..., 0] + inverse[..., None] * t
     z = y[..., 2:].clamp(min=0.05)
-    f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]
+    f = intrinsics[:, None, None, :2]
+    c = intrinsics[:, None, None, 2:]
     start = y[..., :2] / z * f + c
     error = (start - truth).clamp(-200, 200).nan_to_num(0)
     mean = error.norm(dim=-1).flatten(1).median(1).values

@@ -11,8 +11,8 @@ import pytest
 from crafted_checkpoints import reseal
 from geogs.application import run as runs
 from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
+from geogs.application.checkpoints.folder import is_sealed, seal
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, SavedRun
-from geogs.application.checkpoints.seal import is_sealed, seal
 from geogs.application.named_files import options_missing
 from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli

@@ -10,19 +10,12 @@ import torch
 from scipy.spatial import cKDTree
 
 from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
-from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
+from geogs.application.reconstruct import ReconstructState, fingerprint, read_work
 from geogs.cli import main as cli
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.reconstruction import Reconstruction
-from posed_scene import (
-    DEFAULT,
-    SMALL,
-    ball_and_wall,
-    depth_errors,
-    surface_points,
-    vertices,
-)
+from posed_scene import DEFAULT, SMALL, ball_and_wall, depth_errors, surface_points, vertices
 from stopped_commands import stop
 
 pytestmark = pytest.mark.system
@@ -136,7 +129,7 @@ def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     assert "--resume goes on" in said
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
     assert checkpoint.is_file()
-    assert cli.main([*map(str, call), "--resume", "--mapping.disk.opacity", "0.6"]) == 2
+    assert cli.main([*map(str, call), "--resume", "--mapping.disk.stride", "9"]) == 2
     said = capsys.readouterr().err
     assert "other settings" in said.splitlines()[-1]
     assert "Traceback" not in said

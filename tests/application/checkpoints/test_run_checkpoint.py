@@ -18,8 +18,8 @@ from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from geogs.world.archive import Archive, Archived
+from geogs.world.disks import GrowingRows
 from geogs.world.grid import SampleGrid
-from geogs.world.growing_rows import GrowingRows
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.world import World
 from quick_systems import Work, quick_config

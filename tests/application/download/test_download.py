@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geogs.application.download.download import download
+from geogs.application.download.download import download, unpack
 from geogs.application.download.sequences import (
     SEQUENCES,
     PublicFile,
     PublicSequence,
     find_sequence,
 )
-from geogs.application.download.unpack import unpack
 from geogs.cli.main import main
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
@@ -202,7 +201,7 @@ def test_archives_cannot_reach_out_of_their_folder(tmp_path, write):
 
 
 def test_an_archive_of_next_to_nothing_does_not_fill_the_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr("geogs.application.download.unpack._MIN_LIMIT", 1 << 20)
+    monkeypatch.setattr("geogs.application.download.download._MIN_LIMIT", 1 << 20)
     with zipfile.ZipFile(tmp_path / "archive", "w", zipfile.ZIP_DEFLATED) as packed:
         for k in range(3):
             packed.writestr(f"{k}.bin", bytes(400 << 10))

@@ -10,7 +10,7 @@ import pytest
 import geogs
 from geogs.application.export.export import export
 from geogs.application.result_settings import ExportSettings, RemeshSettings
-from geogs.application.results.remesh import remesh
+from geogs.application.results.revise import remesh
 from geogs.application.results.saved_result import SavedResult
 from geogs.cli.main import main
 from geogs.config import MeshConfig

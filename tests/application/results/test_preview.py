@@ -7,7 +7,7 @@ import pytest
 
 from geogs.application import tracked_video
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.preview import NAME, preview
+from geogs.application.results.surfaces import PREVIEW, preview
 from geogs.application.run import run
 from geogs.application.run_settings import RunSettings
 from geogs.config import InputConfig
@@ -30,7 +30,9 @@ class Looked(RunProgress):
 
     def stage(self, name: str, fraction: float) -> None:
         if name == "mapping" and self.seen is None:
-            self.seen = (self.folder / NAME).read_bytes() if (self.folder / NAME).is_file() else b""
+            self.seen = (
+                (self.folder / PREVIEW).read_bytes() if (self.folder / PREVIEW).is_file() else b""
+            )
 
 
 @pytest.mark.system
@@ -44,8 +46,8 @@ def test_it_is_there_before_the_map_and_gone_with_the_result(small_room, tmp_pat
     result = run(RunSettings((small_room,), config, output, "cpu"), looked)
     assert looked.seen
     (said,) = [text for text in looked.said if "rough mesh" in text]
-    assert str(output / NAME) in said
-    assert not (output / NAME).exists()
+    assert str(output / PREVIEW) in said
+    assert not (output / PREVIEW).exists()
     slam = result.scene
     rough, mesh = preview(slam), result.mesh
     (tmp_path / "seen.ply").write_bytes(looked.seen)
@@ -61,7 +63,7 @@ def test_it_is_part_of_the_result_that_is_being_made(tmp_path):
     (tmp_path / "mine.ply").write_text("of the user")
     with replaced(tmp_path, "result") as new:
         with replaced(tmp_path, "part") as part:
-            (part / NAME).write_text("rough")
-        assert (tmp_path / NAME).read_text() == "rough"
+            (part / PREVIEW).write_text("rough")
+        assert (tmp_path / PREVIEW).read_text() == "rough"
         (new / "mesh.ply").write_text("whole")
     assert sorted(p.name for p in tmp_path.glob("*.ply")) == ["mesh.ply", "mine.ply"]

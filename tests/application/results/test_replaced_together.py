@@ -25,9 +25,7 @@ from geogs.application.result_settings import (
     RemeshSettings,
     RescaleSettings,
 )
-from geogs.application.results import remesh as remeshing
-from geogs.application.results import rescale as rescaling
-from geogs.application.results import surfaces
+from geogs.application.results import revise, surfaces
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import write_stage
@@ -124,7 +122,7 @@ def quick(monkeypatch) -> None:
     surface = Mesh(MESH.vertices + 1, MESH.faces, MESH.normals)
     monkeypatch.setattr(surfaces, "extract_mesh", lambda *_: surface)
     found = MetricScale("a known distance", FACTOR, 0.01)
-    monkeypatch.setattr(rescaling, "find_scale", lambda *_: found)
+    monkeypatch.setattr(revise, "find_scale", lambda *_: found)
     for module in ("run_page", "evaluation_page"):
         monkeypatch.setattr(
             f"geogs.evaluation.pages.{module}.model_section", lambda model: ("", ())
@@ -158,8 +156,8 @@ def commands(made, tmp_path) -> dict[str, Callable[[Path], object]]:
     truth = made / "trajectory.tum"
     return {
         "run": a_run(SavedScene(load_result(made)), images),
-        "mesh": lambda folder: remeshing.remesh(RemeshSettings(folder, MeshConfig(), device="cpu")),
-        "scale": lambda folder: rescaling.rescale(RescaleSettings(folder, "height:1.6", "cpu")),
+        "mesh": lambda folder: revise.remesh(RemeshSettings(folder, MeshConfig(), device="cpu")),
+        "scale": lambda folder: revise.rescale(RescaleSettings(folder, "height:1.6", "cpu")),
         "eval": lambda folder: evaluate(
             EvalSettings(folder, truth, surface=False, alignment="none", plots=False)
         ),

@@ -10,8 +10,7 @@ from geogs.application.results.result_page import ShownView, shown_model
 from geogs.evaluation.held_camera import level_axes
 from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths
 from geogs.evaluation.model_view.start_view import start_view
-from geogs.evaluation.pages.lengths import lengths
-from geogs.evaluation.pages.run_page import write_run_page
+from geogs.evaluation.pages.run_page import lengths, write_run_page
 from geogs.geometry.camera import Camera
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, Trajectory

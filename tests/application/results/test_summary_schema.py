@@ -11,6 +11,7 @@ from json_schema import faults
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs" / "summary.schema.json").read_text())
 RUN = {
     "source": "v.mp4", "kind": "video", "fingerprint": "0123456789abcdef", "frames": 120,
+    "input": {"found": "v.mp4, 120 images", "used": ["camera: as given"], "left": []},
     "scale": "arbitrary (monocular)", "skipped_images": 0, "damaged_images": 1,
     "shutter": {"readout": 0.0276, "origin": "as given"},
     "verdict": {"is_reliable": True, "sentence": "Well.", "lost": 0.0, "orientation_only": 0.1,

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.ros.node import CameraNode, run_node
+from geogs.application.ros.node import CameraNode, Messages, run_node
 from geogs.application.ros.node_settings import NodeSettings
-from geogs.application.ros.published_messages import Messages
 from geogs.errors import InputError
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot

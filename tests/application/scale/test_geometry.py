@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.scale.distance import KnownDistance, KnownDistances, scale_by_distances
-from geogs.application.scale.ground import CameraHeight, ground_plane, scale_by_height
+from geogs.application.scale.known_length import (
+    CameraHeight,
+    KnownDistance,
+    KnownDistances,
+    ground_plane,
+    scale_by_distances,
+    scale_by_height,
+)
 from geogs.application.scale.measurable_scene import MeasurableScene, SeenKeyframe
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

@@ -2,11 +2,17 @@
 
 import pytest
 
-from geogs.application.scale.distance import KnownDistance, KnownDistances
-from geogs.application.scale.ground import CameraHeight
-from geogs.application.scale.known_length import SensorScale, scale_source
+from geogs.application.scale.known_length import (
+    CameraHeight,
+    KnownDistance,
+    KnownDistances,
+    SensorScale,
+    scale_source,
+    sentences_on_poses,
+)
 from geogs.application.scale.tags import TagSize
 from geogs.errors import InputError
+from geogs.tracking.graph.measured_odometry import OdometryAgreement
 
 
 def test_each_kind_is_understood():
@@ -33,3 +39,13 @@ def test_each_kind_is_understood():
 def test_mistakes_are_told(text, why):
     with pytest.raises(InputError, match=why):
         scale_source(text)
+
+
+def test_poses_that_do_not_fit_are_told():
+    assert sentences_on_poses(OdometryAgreement(0, 0.0, False)) == []
+    (used,) = sentences_on_poses(OdometryAgreement(20, 0.85, True))
+    assert used == (
+        "Poses beside the images: 85% of 20 motions between keyframes fit what the images show."
+    )
+    (refused,) = sentences_on_poses(OdometryAgreement(20, 0.05, False))
+    assert refused.startswith("warning: the poses beside the images are not used: only 5% of 20")

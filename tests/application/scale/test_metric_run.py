@@ -10,9 +10,12 @@ import pytest
 
 from geogs.application.run import run
 from geogs.application.run_settings import RunSettings
-from geogs.application.scale.apply import measurable_run
-from geogs.application.scale.distance import KnownDistances, scale_by_distances
-from geogs.application.scale.known_length import scale_source
+from geogs.application.scale.known_length import (
+    KnownDistances,
+    measurable_run,
+    scale_by_distances,
+    scale_source,
+)
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source

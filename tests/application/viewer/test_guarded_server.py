@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from geogs.application.results.saved_result import load_result
-from geogs.application.viewer.browser_window import Window
-from geogs.application.viewer.guarded_server import GuardedServer
+from geogs.application.viewer.browser_window import GuardedServer, Window
 from geogs.errors import InputError
 from saved_results import make_result
 

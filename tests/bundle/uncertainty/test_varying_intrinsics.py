@@ -139,7 +139,8 @@ def test_matches_tell_the_lens_of_each_frame_and_which_of_its_sizes_varies(focal
     want = sizes[:, list(OWN)]
     got, want = (x - x.mean(0) for x in (own, want))  # the mean is the lens of all
     assert float((got - want).square().mean().sqrt()) < 0.3 * float(want.square().mean().sqrt())
-    alone = [max(prior.jitter[0], prior.drift), *prior.jitter[1:]]
+    jitter, *centre, drift = prior.deviations
+    alone = [max(jitter, drift), *centre]
     varying = alone.pop(0 if focal else 1)
     assert varying > 1.5 * max(alone)  # four frames tell little
 
@@ -148,7 +149,7 @@ def test_of_a_lens_that_stays_nothing_is_to_be_explained():
     found = evidence(torch.zeros(N, SHAPES), noise=0.1)
     step, prior = found.told(TIMES, torch.zeros_like(found.gradient), FIRST, SHARED)
     assert found.explained(step) < 0.05
-    assert max(prior.jitter) < 0.005  # four frames tell little of a deviation
+    assert max(prior.deviations[:3]) < 0.005  # four frames tell little of a deviation
 
 
 def test_deviations_are_those_that_samples_were_drawn_with():
@@ -159,8 +160,8 @@ def test_deviations_are_those_that_samples_were_drawn_with():
     prior = FIRST
     for _ in range(60):
         prior = prior.suited(times, own, torch.zeros(n, 3, n, 3).double())
-    assert prior.jitter == pytest.approx((0.003, 0.01, 0.001), rel=0.2)
-    assert prior.drift == pytest.approx(0.05, rel=0.4)
+    assert prior.deviations[:3] == pytest.approx((0.003, 0.01, 0.001), rel=0.2)
+    assert prior.deviations[3] == pytest.approx(0.05, rel=0.4)
 
 
 def test_times_need_not_grow_as_those_of_a_saved_map_do_not():
@@ -172,7 +173,7 @@ def test_times_need_not_grow_as_those_of_a_saved_map_do_not():
 
 
 def test_between_keyframes_a_focal_length_is_known_worst_half_way():
-    prior = VaryingPrior((0.001, 0.002, 0.003), 0.04)
+    prior = VaryingPrior((0.001, 0.002, 0.003, 0.04))
     found = prior.between(np.array([0.0, 1.0, 4.0]), np.array([0.0, 0.5, 1.0, 2.5]))
     focal = [0.001**2 + 0.04**2 * part for part in (0, 0.25 / 4, 0, 0.25 * 3 / 4)]
     np.testing.assert_allclose(found[:, 0], np.sqrt(focal))

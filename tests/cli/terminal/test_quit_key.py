@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from geogs.cli.terminal.quit_key import quit_key
+from geogs.cli.run import quit_key
 
 pty = pytest.importorskip("pty")
 

@@ -10,7 +10,7 @@ GEOGS = f"{sys.executable} -m geogs.cli.main"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 NUMBERS = """
 import os, sys
-from geogs.cli.terminal.streams import make_unbreakable
+from geogs.cli.terminal.process import make_unbreakable
 make_unbreakable()
 file = open(sys.argv[1], "w")
 print("lost")

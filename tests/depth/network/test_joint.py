@@ -11,7 +11,7 @@ from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.engine_choice import depth_engine
-from geogs.depth.network.joint import AGREE, CHOICE, DIFFER, MEAN, REACH, joined
+from geogs.depth.network.engine import AGREE, CHOICE, DIFFER, MEAN, REACH, joined
 from geogs.geometry.camera import Camera
 
 

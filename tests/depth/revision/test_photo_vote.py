@@ -8,14 +8,13 @@ from torch.nn.functional import max_pool2d
 from cuda_emulator import use_emulator
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.classical import CpuDepthEngine
-from geogs.depth.cuda import far_side as cuda_far_side
-from geogs.depth.cuda import photo_vote as cuda_photo_vote
+from geogs.depth.cuda import revision as on_gpu
 from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth
-from geogs.depth.revision import far_side
-from geogs.depth.revision.far_side import MIN_GAP, REACH, FarSideSearch
+from geogs.depth.revision import revised_searches
 from geogs.depth.revision.photo_vote import CONTRAST, DEVIATIONS, LEAST_DEVIATION, RADIUS
+from geogs.depth.revision.revised_searches import MIN_GAP, REACH, FarSideSearch
 from geogs.geometry.camera import Camera
 from oracles.revision_reference import (
     averaged_by_colour,
@@ -135,7 +134,7 @@ def test_compiled_loops_say_the_same(everywhere):
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_a_gpu_says_the_same(device, everywhere, monkeypatch):
     if device == "emulated":
-        use_emulator(monkeypatch, cuda_photo_vote)
+        use_emulator(monkeypatch, on_gpu)
         device = "cpu"
     elif not torch.cuda.is_available():
         pytest.skip("needs an NVIDIA GPU")
@@ -169,12 +168,12 @@ def test_the_same_surfaces_go_on(seed, reach, where, monkeypatch):
     depth = steps(seed)
     expected = farther_surface(depth, reach)
     if where == "emulated":
-        use_emulator(monkeypatch, cuda_far_side)
-        found = cuda_far_side.farther_surface(depth, reach)
+        use_emulator(monkeypatch, on_gpu)
+        found = on_gpu.farther_surface(depth, reach)
     elif where == "cpu":
-        found = far_side.farther_surface(depth, reach)
+        found = revised_searches.farther_surface(depth, reach)
     elif torch.cuda.is_available():
-        found = cuda_far_side.farther_surface(depth.cuda(), reach).cpu()
+        found = on_gpu.farther_surface(depth.cuda(), reach).cpu()
     else:
         pytest.skip("needs an NVIDIA GPU")
     assert 0.02 < float((expected > 0).float().mean()) < 0.6

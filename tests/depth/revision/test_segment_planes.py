@@ -7,15 +7,12 @@ import torch
 
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.depth.revision import segment_plane_kernels as kernels
-from geogs.depth.revision.bare_segments import MIN_AREA, bare_segments
 from geogs.depth.revision.segment_plane_kernels import PlaneRules
 from geogs.depth.revision.segment_planes import (
     CONFIDENCE,
-    CORRELATED,
-    MIN_EXPLAINED,
-    MIN_ON_PLANE,
+    MIN_AREA,
     MOST_PLANES,
-    TOLERANCE,
+    bare_segments,
     on_planes,
     planar_depth,
 )
@@ -169,7 +166,7 @@ def test_normals_are_those_of_the_plane(slopes):
     assert not planar.normal[0, 0].any()
 
 
-RULES = PlaneRules(2, TOLERANCE, MIN_EXPLAINED, MIN_ON_PLANE, CORRELATED, 40, 750, 4)
+RULES = PlaneRules(2)
 
 
 def slow_planes(x, y, value, weight, rng):
@@ -180,17 +177,19 @@ def slow_planes(x, y, value, weight, rng):
         drawn = rng.choice(len(left), (64, 3), p=w / w.sum())
         drawn = drawn[np.abs(np.linalg.det(at[drawn])) > 1e-9]
         tried = np.linalg.solve(at[drawn], v[drawn][..., None])[..., 0]
-        ons = np.abs(tried @ at.T - v) < TOLERANCE * v
+        ons = np.abs(tried @ at.T - v) < RULES.tolerance * v
         on = ons[np.argmax((ons * w).sum(1))]
         for _ in range(RULES.refits):
             root = np.sqrt(w[on])
             plane = np.linalg.lstsq(at[on] * root[:, None], v[on] * root, rcond=None)[0]
-            fitted, on = on, np.abs(at @ plane - v) < TOLERANCE * v
-        if w[on].sum() < MIN_EXPLAINED * weight.sum():
+            fitted, on = on, np.abs(at @ plane - v) < RULES.tolerance * v
+        if w[on].sum() < RULES.min_explained * weight.sum():
             break
         information = (at[fitted] * w[fitted, None]).T @ at[fitted]
-        deviation = TOLERANCE / 2 * v[on].mean()
-        planes.append((plane, CORRELATED * deviation**2 * np.linalg.inv(information), left[on]))
+        deviation = RULES.tolerance / 2 * v[on].mean()
+        planes.append(
+            (plane, RULES.correlated * deviation**2 * np.linalg.inv(information), left[on])
+        )
         left = left[~on]
     return planes
 
@@ -253,7 +252,7 @@ def test_rims_and_parts_are_those_of_opencv(seed):
     for number in range(1, count):
         part = numbers == number
         around = (cv2.dilate(part.astype(np.uint8), rim) > 0) & sure
-        least = MIN_ON_PLANE * max(1, around.sum())
+        least = RULES.min_on_plane * max(1, around.sum())
         if part.sum() >= 12 and (around & (depth == 1)).sum() >= least:
             expected |= part
     assert expected.any()

@@ -30,3 +30,11 @@ def test_addresses(words, kind, target, name):
 )
 def test_paths_are_none(words):
     assert live_address(words) is None
+
+
+@pytest.mark.parametrize("name", ["play:x.mp4", "camera:0"])
+def test_a_file_of_such_a_name_is_a_file(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    assert live_address(Path(f"./{name}")) is not None
+    (tmp_path / name).write_bytes(b"a video")
+    assert live_address(Path(f"./{name}")) is None

@@ -48,7 +48,7 @@ def test_depths_that_are_listed_and_not_there_are_none(tmp_path, caplog):
         open_source(tmp_path, SENSOR)
     auto = open_source(tmp_path, InputConfig(depth="auto"))
     assert not auto.uses_depth
-    assert "names 2 pictures of depth, of which none is there" in auto.depths_found[0]
+    assert "names 2 pictures of depth, of which none is there" in auto.account.left[0]
     (tmp_path / "depth").mkdir()
     (tmp_path / "depth/a.png").write_bytes(b"no picture")
     (tmp_path / "depth/b.png").write_bytes(b"")
@@ -58,9 +58,8 @@ def test_depths_that_are_listed_and_not_there_are_none(tmp_path, caplog):
     write_depth(tmp_path / "depth/a.png", np.full((48, 64), 5000))
     source = open_source(tmp_path, SENSOR)
     assert "1 of 2 pictures of depth are missing, such as b.png" in caplog.text
-    assert source.depths_found == [
-        f"The depth of a sensor beside {tmp_path.name} is used: 1 of 2 images."
-    ]
+    beside = "sensor depth beside 1 of 2 images, 1/5000 m a unit (TUM's), median 1 m"
+    assert beside in source.account.used
     (tmp_path / "depth.txt").write_text("5.00 depth/a.png\n")
     with pytest.raises(InputError, match="is near that of an image"):
         open_source(tmp_path, SENSOR)
@@ -128,7 +127,7 @@ def test_a_source_without_depth_says_so(tmp_path):
 
 def test_pictures_that_cannot_be_read_are_no_depth(tmp_path):
     (tmp_path / "depth.png").write_bytes(b"no picture")
-    assert DepthFile(tmp_path / "depth.png", 1000.0).metres() is None
+    assert DepthFile(tmp_path / "depth.png").metres() is None
 
 
 def test_surfaces_are_interpolated_and_edges_are_not():

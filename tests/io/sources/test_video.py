@@ -1,7 +1,10 @@
 """Videos: real time stamps, rotation, damage, seeking by counting."""
 
+import itertools
 import logging
+import struct
 from dataclasses import replace
+from fractions import Fraction
 
 import av
 import numpy as np
@@ -10,7 +13,7 @@ import pytest
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.formats import video_file
-from geogs.io.sources.formats.video_file import clockwise_quarter_turns, turn_upright
+from geogs.io.sources.formats.video_file import turn_upright
 from geogs.io.sources.sniff import open_source
 from io_samples import gradient_image, write_video
 
@@ -75,12 +78,50 @@ def test_rotated_video_is_upright_with_its_intrinsics(tmp_path, rotation):
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected[rotation]
 
 
-def test_display_angle_to_quarter_turns():
-    angles = (0.0, -90.0, 90.0, 180.0, -180.0, 89.9)
-    assert [clockwise_quarter_turns(a) for a in angles] == [0, 1, 3, 2, 2, 3]
+def test_quarter_turns_are_clockwise():
     image = gradient_image(0)
     np.testing.assert_array_equal(turn_upright(image, 1)[0, -1], image[0, 0])
     np.testing.assert_array_equal(turn_upright(image, 2), image[::-1, ::-1])
+
+
+@pytest.mark.parametrize("signs", itertools.product((-1, 1), repeat=2))
+@pytest.mark.parametrize("swaps", [False, True])
+def test_a_video_is_shown_by_its_display_matrix_mirrored_too(tmp_path, signs, swaps):
+    """A stored position (x, y) is shown at (a x + c y, b x + d y)."""
+    a, d, b, c = (0, 0, *signs) if swaps else (*signs, 0, 0)
+    path = write_video(tmp_path / "v.mp4", IMAGES[:2])
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44
+    one = 1 << 16
+    struct.pack_into(">9i", data, at, a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    source = open_source(path, InputConfig(long_edge=0))
+    shown = next(iter(source)).image.astype(int)
+    stored = gradient_image(0)
+    expected = stored if a else stored.transpose(1, 0, 2)
+    expected = expected[:, ::-1] if min(a, c) < 0 else expected
+    expected = expected[::-1] if min(b, d) < 0 else expected
+    assert shown.shape == expected.shape
+    assert np.abs(shown - expected).mean() < 6
+    is_said = any("mirrored" in line for line in source.account.used)
+    assert is_said == (a * d - b * c < 0)
+
+
+@pytest.mark.parametrize(("aspect", "ratio"), [((4, 3), 0.75), ((16, 15), 0.9375), ((1, 2), 2.0)])
+@pytest.mark.parametrize("rotation", [0, pytest.param(90, marks=needs_rotation)])
+def test_pixels_that_are_not_square_have_two_focal_lengths(tmp_path, aspect, ratio, rotation):
+    """As the container says, of the upright image; given intrinsics stay as they are."""
+    aspect = Fraction(*aspect)
+    path = write_video(tmp_path / "v.mkv", IMAGES[:2], rotation=rotation, aspect=aspect)
+    guessed = open_source(path, InputConfig(long_edge=0))
+    fx, fy = guessed.calibration.fx, guessed.calibration.fy
+    assert fx / fy == pytest.approx(1 / ratio if rotation else ratio)
+    # Along the longer side as shown, 60 degrees.
+    longer = max(64 * float(aspect), 48)
+    assert max(fx, fy) == pytest.approx(longer * max(ratio, 1) / 2 / np.tan(np.pi / 6))
+    assert "times as wide as high, by the video file" in guessed.account.used[-1]
+    given = open_source(path, InputConfig(intrinsics="50,55,23.5,31.5", long_edge=0)).calibration
+    assert (given.fx, given.fy) == (50, 55)
 
 
 @pytest.mark.parametrize(
@@ -138,8 +179,30 @@ def test_video_without_its_index_cannot_be_opened(tmp_path):
 def test_start_beyond_the_end_of_a_video(tmp_path):
     path = write_video(tmp_path / "v.mkv", IMAGES)
     source = open_source(path, InputConfig(start=50))
+    assert source.spread(8) == []
     with pytest.raises(InputError, match="ends before frame 50"):
         list(source)
     path = write_video(tmp_path / "v.mp4", IMAGES)
     with pytest.raises(InputError, match="only 12 frames"):
         open_source(path, InputConfig(start=50))
+
+
+@pytest.mark.parametrize(("size", "scaled"), [((48, 36), 5), ((128, 96), 5), ((48, 64), 0)])
+def test_a_resolution_that_changes_in_mid_stream(tmp_path, caplog, size, scaled):
+    """Images of the same shape are scaled, others are skipped; both are said once."""
+    parts = [
+        write_video(tmp_path / f"{n}.ts", [gradient_image(i, *at) for i in range(5)])
+        for n, at in enumerate([(64, 48), size])
+    ]
+    both = tmp_path / "both.ts"
+    both.write_bytes(b"".join(part.read_bytes() for part in parts))
+    source = open_source(both, NATIVE)
+    with caplog.at_level(logging.WARNING, logger="geogs"):
+        frames = list(source)
+    assert len(frames) == 5 + scaled
+    said = f"is {size[0]}x{size[1]}" + (": scaled to 64x48" if scaled else " but the others are")
+    assert sum(said in line for line in caplog.messages) == 1
+    assert not any("cut off" in line for line in caplog.messages)
+    for k, frame in enumerate(frames):
+        assert np.abs(frame.image.astype(int) - gradient_image(k % 5)).mean() < 6
+    assert source.place.recordings[0].scaled == scaled

@@ -7,9 +7,9 @@ import torch
 from cuda_emulator import emulated_kernels
 from geogs.mesh.decimation import collapse
 from geogs.mesh.decimation.collapse import CollapsingMesh
-from geogs.mesh.decimation.collapse_kernels import merged
+from geogs.mesh.decimation.decimation_kernels import merged
 from geogs.mesh.triangle_mesh import Mesh
-from geogs.mesh.volume.marching import march
+from geogs.mesh.volume.level_set import march
 from surface_shapes import hills
 
 HAS_GPU = torch.cuda.is_available()

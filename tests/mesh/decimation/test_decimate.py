@@ -6,9 +6,15 @@ import torch
 
 from geogs.errors import InputError
 from geogs.io.writers.ply_writer import write_mesh
-from geogs.mesh.decimation.decimate import MEAN_FRACTION, QUANTILE, decimate, with_at_most
-from geogs.mesh.decimation.deviation import host_deviations, triangle_distances
-from geogs.mesh.decimation.deviation_kernels import triangle_distance
+from geogs.mesh.decimation.decimate import (
+    MEAN_FRACTION,
+    QUANTILE,
+    decimate,
+    host_deviations,
+    triangle_distances,
+    with_at_most,
+)
+from geogs.mesh.decimation.decimation_kernels import triangle_distance
 from geogs.mesh.mesh_file import read_mesh
 from geogs.mesh.triangle_mesh import Mesh
 from surface_shapes import hills

@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from geogs_synth.camera.camera_batch import pixel_grid, rays
-from geogs_synth.camera.develop import develop
-from geogs_synth.camera.jpeg import compress
-from geogs_synth.camera.random_flaws import draw_flaws
+from geogs_synth.camera.clip_camera import compress, develop, draw_flaws
 from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import RoomSampler

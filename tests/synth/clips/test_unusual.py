@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from geogs_synth.camera.camera_batch import pixel_grid, project, rays
-from geogs_synth.camera.motion_blur import exposed, motion_while_open
+from geogs_synth.camera.clip_camera import exposed, motion_while_open
 from geogs_synth.clips.clip_batch import ClipBatch
+from geogs_synth.clips.dynamics import draw_shake
 from geogs_synth.clips.room_options import (
     SCENE_KINDS,
     STREET,
@@ -16,7 +17,6 @@ from geogs_synth.clips.room_options import (
     only_scene,
 )
 from geogs_synth.clips.sampler import RoomSampler, draw_plan
-from geogs_synth.clips.shake import draw_shake
 from geogs_synth.draw import Draw, rotated, rotation_matrix
 from geogs_train.flow.flow_pairs import REPEATING, flow_batch
 from geogs_train.flow.starts import StartOptions

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.focal_uncertainty import Estimate, with_prior
+from geogs.tracking.calibration.self_calibration import Estimate, with_prior
 
 CAMERA = Camera(300.0, 310.0, 159.5, 119.5, 320, 240)
 

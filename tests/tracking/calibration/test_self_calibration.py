@@ -9,15 +9,14 @@ import pytest
 import torch
 
 import tracking_scenes
-from geogs.bundle.lens import lens_rays
-from geogs.camera.shutter.readout import FoundReadout
+from geogs.bundle.lens import LensBlock
 from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.shutter import FoundReadout
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration import self_calibration, stretch
+from geogs.tracking.calibration import self_calibration
 from geogs.tracking.calibration.degeneracy import Degeneracy
-from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
-from geogs.tracking.calibration.self_calibration import _row_times, self_calibrate
+from geogs.tracking.calibration.self_calibration import LEAST_DEVIATION, _row_times, self_calibrate
 from geogs.tracking.calibration.unknowns import Unknowns
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
@@ -27,8 +26,8 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(autouse=True)
 def _few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stretch, "START_KEYFRAMES", 8)
-    monkeypatch.setattr(stretch, "KEYFRAMES", 16)
+    monkeypatch.setattr(self_calibration, "START_KEYFRAMES", 8)
+    monkeypatch.setattr(self_calibration, "KEYFRAMES", 16)
 
 
 def swinging(count: int) -> list[np.ndarray]:
@@ -66,7 +65,7 @@ def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkey
         return adjust(bundle)
 
     monkeypatch.setattr(GrowingBundle, "adjust", noted)
-    monkeypatch.setattr(stretch, "MAX_COST", np.inf)
+    monkeypatch.setattr(self_calibration, "MAX_COST", np.inf)
     video = list(rolled(30, readout))
     guess, rolling = CAMERA.with_focal(0.8 * CAMERA.fx), RollingCamera(CAMERA)
     off, residuals = [], []
@@ -150,9 +149,8 @@ def test_the_distortion_of_a_pinhole_is_about_none():
 @pytest.mark.long
 def test_finds_the_distortion_of_a_barrel_lens():
     wide = Camera(CAMERA.fx, CAMERA.fy, 143.5, 107.5, 288, 216)
-    rays = lens_rays(
-        CAMERA.moved(0.0, -0.2, 0.05), torch.from_numpy(pixels_of(CAMERA))
-    ).rays.numpy()
+    barrel = CAMERA.moved(0.0, -0.2, 0.05)
+    rays = LensBlock(barrel, torch.from_numpy(pixels_of(CAMERA))).rays.numpy()
     at = (rays @ wide.matrix().numpy().T.astype(np.float32))[:, :2]
     at = at.reshape(CAMERA.height, CAMERA.width, 2)
     video = [
@@ -207,8 +205,8 @@ def test_a_plane_is_said_to_be_one(monkeypatch):
 def test_that_nothing_explains_a_stretch_is_what_is_said(monkeypatch):
     said = iter(["its motion could not be followed", Degeneracy.UNEXPLAINED.value])
     monkeypatch.setattr(self_calibration, "STRETCHES", 2)
-    monkeypatch.setattr(stretch, "START_KEYFRAMES", 2)
-    monkeypatch.setattr(stretch.Stretch, "ask", lambda self: next(said))
+    monkeypatch.setattr(self_calibration, "START_KEYFRAMES", 2)
+    monkeypatch.setattr(self_calibration.Stretch, "ask", lambda self: next(said))
     found = self_calibrate(frames(swinging(4)), CAMERA.with_focal(120.0))
     assert found.failure == Degeneracy.UNEXPLAINED.value
 

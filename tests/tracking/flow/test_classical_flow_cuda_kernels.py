@@ -11,9 +11,8 @@ from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow import classical_flow_cuda
 from geogs.tracking.flow.cell_texture import SHARP, UNINFORMED
-from geogs.tracking.flow.classical_flow import ClassicalFlow, _DenseFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow, StartFlow, _DenseFlow
 from geogs.tracking.flow.classical_flow_cuda import DEVIATION, SOURCES, CudaClassicalFlow
-from geogs.tracking.flow.start_flow import StartFlow
 from geogs.world.grid import SampleGrid
 
 ALPHA, GAMMA, DELTA, ZETA2, EPS2, RELAXATION = 30.0, 10.0, 2.0, 0.01, 1e-4, 1.5

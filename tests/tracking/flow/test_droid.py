@@ -9,23 +9,17 @@ import torch
 
 from droid_state import public_state
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.depth_terms import DepthDamping
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import DepthDamping
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.networks.tensor_files import read_tensors
-from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
-from geogs.tracking.flow.droid_network import (
-    CORRELATION_SCALE,
-    LEVELS,
-    RADIUS,
-    DroidNetwork,
-    load_droid,
-)
+from geogs.tracking.flow.droid_network import DroidNetwork, load_droid
 from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.flow.lookup import CorrelationVolume
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
@@ -185,7 +179,7 @@ def test_the_start_of_an_edge_is_the_context_of_its_source(operator, views, star
         flow = position - ((GRID.pixels - 4) / 8).reshape(1, GRID.height, GRID.width, 2)
         motion = torch.cat([flow, 0 * flow], -1).permute(0, 3, 1, 2)
         features = [view.features[None] for view in views[:2]]
-        correlation = CorrelationVolume(*features, LEVELS, RADIUS, CORRELATION_SCALE)(position)
+        correlation = CorrelationVolume(*features)(position)
         out = once.network.update(hidden, static, correlation, motion)
     expected = position + out.delta.permute(0, 2, 3, 1)
     torch.testing.assert_close(there.pixels, (4 + 8 * expected).flatten(1, 2), rtol=1e-4, atol=1e-3)

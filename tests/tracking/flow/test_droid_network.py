@@ -6,17 +6,9 @@ from torch.nn import functional as F
 
 from droid_state import LAYERS, public_state
 from geogs.errors import InputError
-from geogs.tracking.flow.correlation import CorrelationVolume
-from geogs.tracking.flow.droid_network import (
-    CORRELATION_SCALE,
-    LEVELS,
-    LOOKUP,
-    RADIUS,
-    DroidNetwork,
-    cell_positions,
-    load_droid,
-    motion_features,
-)
+from geogs.tracking.flow.droid_network import DroidNetwork, load_droid, motion_features
+from geogs.tracking.flow.lookup import CorrelationVolume
+from geogs.tracking.flow.network_parts import cell_positions
 
 
 @pytest.fixture(scope="module")
@@ -88,10 +80,10 @@ def test_correlation_finds_itself_and_a_shift(network):
     with torch.no_grad():
         first = network.features(textured())
     second = first.roll(1, dims=3)
-    at = cell_positions(*first.shape[2:])[None]
+    at = cell_positions(*first.shape[2:], first)[None]
     for other, channel in ((first, 24), (second, 31)):
-        found = CorrelationVolume(first, other, LEVELS, RADIUS, CORRELATION_SCALE)(at)
-        assert found.shape == (1, LOOKUP, 12, 16)
+        found = CorrelationVolume(first, other)(at)
+        assert found.shape == (1, 196, 12, 16)
         best = found[0, :49, :, :-1].argmax(0)
         assert float((best == channel).float().mean()) > 0.85
         # One sixteenth of the product, nothing else.
@@ -143,7 +135,7 @@ def test_aggregation_groups_edges_by_source(network):
 
 
 def test_motion_is_flow_and_last_error_cut_off():
-    position = cell_positions(3, 4)[None] + torch.tensor([5.0, -100.0])
+    position = cell_positions(3, 4, torch.empty(0))[None] + torch.tensor([5.0, -100.0])
     target = position + torch.tensor([-0.25, 70.0])
     motion = motion_features(position, target)
     torch.testing.assert_close(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geogs.tracking.flow.warp_kernels import warp
+from geogs.tracking.flow.flow_kernels import warp
 
 
 def warped(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

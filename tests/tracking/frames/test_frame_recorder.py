@@ -9,11 +9,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frame_lenses import shift_frames
 from geogs.tracking.frames.frame_recorder import FrameRecorder, pose_of
 from geogs.tracking.frames.interpolation import interpolate
-from geogs.tracking.frames.pose_filling import (
-    depth_aware_weight,
-    row_errors,
-    solve_trajectory,
-)
+from geogs.tracking.frames.pose_filling import depth_aware_weight, row_errors, solve_trajectory
 from geogs.types import FlowMatch, Frame, FrameLens, SeenRows
 from geogs.world.frames import FrameLog
 from planted_walk import planted_tracker

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.depth_terms import DepthDamping
+from geogs.bundle.terms import DepthDamping
 from geogs.tracking.flow.flow_operator import FlowOperator, Memories
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.types import FlowMatch

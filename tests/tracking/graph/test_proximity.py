@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-import geogs.tracking.graph.overlap as overlap
 import geogs.tracking.graph.proximity as proximity
 from geogs.geometry.lie import se3_exp
-from geogs.tracking.graph.overlap import LARGEST_ZOOM, alike_in_size, may_overlap
-from geogs.tracking.graph.proximity import frame_distances, proximity_pairs
+from geogs.tracking.graph.proximity import (
+    LARGEST_ZOOM,
+    alike_in_size,
+    frame_distances,
+    may_overlap,
+    proximity_pairs,
+)
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from planted_walk import SMALL, planted_tracker
@@ -45,8 +49,8 @@ def test_no_pair_within_reach_is_left_out():
 def test_keyframes_that_are_skipped_as_a_whole_have_no_tile_in_view():
     for store in (scattered(60), planted_tracker(200)[0].keyframes):
         ids = store.ids
-        spheres = overlap._spheres(store, ids)
-        planes = overlap._view_planes(store.grid.camera, store.poses(ids))
+        spheres = proximity._spheres(store, ids)
+        planes = proximity._view_planes(store.grid.camera, store.poses(ids))
         seen = spheres.reach(*planes).float() @ spheres.fraction
         expected = (seen > 0.2 - 1e-6).numpy()
         assert np.array_equal(may_overlap(store, ids, ids, 0.2), expected)

@@ -28,7 +28,18 @@ def motion(
 ) -> FrameMotion:
     match = FlowMatch(torch.full((1, 8, 2), at), torch.ones(1, 8, 2))
     eye, check = torch.eye(4, dtype=torch.float64), PhotometricCheck(correlation, 100)
-    return FrameMotion(0, eye, match, 9.0, 9.0, matched, overlap, known, 0.3, check)
+    return FrameMotion(
+        9.0,
+        overlap,
+        match,
+        9.0,
+        keyframe=0,
+        T_cw=eye,
+        matched=matched,
+        known=known,
+        residual=0.3,
+        check=check,
+    )
 
 
 def searched(

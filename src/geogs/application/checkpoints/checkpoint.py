@@ -33,9 +33,6 @@ S = TypeVar("S")
 _UNUSABLE = (OSError, InputError, SafetensorError, MemoryError, RuntimeError, *UNUSABLE)
 """Errors of reading an untrusted file."""
 
-_MAX_TIME_FRACTION = 0.05
-"""Fraction of the time of the work that writing checkpoints may take."""
-
 
 class Checkpoint:
     """Writes the state of some work at intervals; a failure is reported once, and work goes on."""
@@ -83,7 +80,8 @@ class Checkpoint:
             self._progress.write(f"No more checkpoints: {error}")
             self._every = 0.0
         now = time.perf_counter()
-        self._due = now + max(self._every, (now - start) / _MAX_TIME_FRACTION)
+        # Fraction of the time of the work that writing checkpoints may take.
+        self._due = now + max(self._every, (now - start) / 0.05)
         return self._every > 0
 
     def remove(self) -> None:
@@ -127,7 +125,8 @@ class SavedState(Generic[S]):
             InputError: it does not match the types of the kind, or an array has changed.
         """
         with self.in_a_sentence():
-            arrays, folder = load(self._read("safetensors")), self._folder
+            arrays = load(self._read("safetensors"))
+            folder = self._folder
             settled = unpack(dict[str, SettledArchive], self._values["archives"], {}, {})
             for foreign in sorted(settled.keys() - self._manifest.files):
                 raise InputError(f"{foreign[:40]!r} is none of its files")

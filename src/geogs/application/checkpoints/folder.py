@@ -3,13 +3,18 @@
 A manifest names every file of ours before it is made, and only those are ever deleted. A state's
 files are new ones each time; it is complete once a manifest with their sizes and checksums has
 replaced the last. Files are opened by plain names in the folder; links are not followed.
+
+A seal proves that this user made a checkpoint with this cache folder: an HMAC-SHA256 by a key of 32
+random bytes that is there alone. A checkpoint without a valid seal is used like any untrusted file.
 """
 
 import errno
 import hashlib
+import hmac
 import json
 import os
 import re
+import secrets
 import stat
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -17,19 +22,70 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from geogs.application.checkpoints.seal import is_sealed, seal
 from geogs.documents import UNUSABLE
 from geogs.errors import InputError, OutputError
+from geogs.gpu.cache import cache_folder
 from geogs.version import __version__
 from geogs.world.arrays import NOT_STORED
 from geogs.world.pack import pack, unpack
+
+_KEY_BYTES = 32
+
+
+def seal(data: bytes) -> str:
+    """The seal of some bytes; empty where no key can be kept."""
+    key = _key() or _new_key()
+    return "" if key is None else hmac.digest(key, data, "sha256").hex()
+
+
+def is_sealed(data: bytes, by: str) -> bool:
+    """Whether this user made that seal of some bytes."""
+    key = _key()
+    if key is None:
+        return False
+    own = hmac.digest(key, data, "sha256").hex()
+    return hmac.compare_digest(own.encode(), by.encode("utf-8", "replace"))
+
+
+def _path() -> Path:
+    return cache_folder() / "checkpoint.key"
+
+
+def _key() -> bytes | None:
+    """The key; none where there is none, or another user could have read or written it."""
+    try:
+        file = os.open(_path(), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return None
+    with os.fdopen(file, "rb") as stream:
+        status = os.fstat(stream.fileno())
+        is_plain = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+        if not is_plain or status.st_uid != os.geteuid() or status.st_mode & 0o077:
+            return None
+        key = stream.read(_KEY_BYTES + 1)
+    return key if len(key) == _KEY_BYTES else None
+
+
+def _new_key() -> bytes | None:
+    """Make and store a key, or take that of a faster process; none if it cannot be stored."""
+    path = _path()
+    unfinished = path.with_name(f"{path.name}.{secrets.token_hex(8)}")
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        with os.fdopen(os.open(unfinished, flags, 0o600), "wb") as stream:
+            stream.write(secrets.token_bytes(_KEY_BYTES))
+        with suppress(FileExistsError):
+            os.link(unfinished, path)  # atomic, and never over another key
+    with suppress(OSError):
+        unfinished.unlink()
+    return _key()
+
 
 FORMAT = "geogs checkpoint 2"
 MANIFEST = "manifest.json"
 _UNFINISHED = ".manifest.json.part"
 _OUR_NAME = re.compile(r"state-\d{1,18}\.(json|safetensors)|archive-[0-9a-f]{16}")
-_LARGEST_MANIFEST = 1 << 24
-"""Largest manifest in bytes; it has about a hundred for every file."""
 _MODES = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}
 
 
@@ -66,7 +122,7 @@ class Manifest:
     files: list[str]
     """All files of ours that may exist, without the manifest."""
     is_own: bool = field(default=False, metadata=NOT_STORED)
-    """Whether this user wrote it, see :mod:`geogs.application.checkpoints.seal`."""
+    """Whether this user wrote it, see :func:`is_sealed`."""
 
 
 class CheckpointFolder:
@@ -87,10 +143,12 @@ class CheckpointFolder:
             if MANIFEST not in os.listdir(folder):
                 return None
         with self._open(MANIFEST, os.O_RDONLY) as file:
-            data = file.read(_LARGEST_MANIFEST)
+            # Largest manifest in bytes; it has about a hundred for every file.
+            data = file.read(1 << 24)
         try:
             given = json.loads(data)
-            checksum, sealed = given.pop("checksum"), str(given.pop("seal", ""))
+            checksum = given.pop("checksum")
+            sealed = str(given.pop("seal", ""))
             manifest: Manifest = unpack(Manifest, given, {}, {})
         except (InputError, *UNUSABLE) as error:
             raise InputError(f"{MANIFEST} is damaged, or none of geogs") from error

@@ -54,9 +54,13 @@ def _tum(name: str, kinect: int, scene: str) -> PublicSequence:
 
 def _icl(name: str, archive: str, truth: str) -> PublicSequence:
     return PublicSequence(
-        f"icl/{name}", archive, PublicFile(f"{_ICL}/{archive}.tar.gz"), "CC BY 3.0",
-        f"{_ICL}/VaFRIC/iclnuim.html", (PublicFile(f"{_ICL}/VaFRIC/{truth}.gt.freiburg"),),
-    )  # fmt: skip
+        f"icl/{name}",
+        archive,
+        PublicFile(f"{_ICL}/{archive}.tar.gz"),
+        "CC BY 3.0",
+        f"{_ICL}/VaFRIC/iclnuim.html",
+        (PublicFile(f"{_ICL}/VaFRIC/{truth}.gt.freiburg"),),
+    )
 
 
 def _eth3d(name: str) -> PublicSequence:

@@ -27,8 +27,6 @@ from geogs.mesh.texture.textured import texture_mesh
 from geogs.mesh.triangle_mesh import median_edge
 from geogs.threads import on_one_torch_thread
 
-TOLERANCE = 2.0
-"""Largest distance of a face from a depth map that shows it, in median mesh edges."""
 _FILES: dict[Format, tuple[str, ...]] = {
     "cloud": ("cloud.ply", ".ply", ".las"),
     "euroc": ("data.csv", ".csv"),
@@ -53,7 +51,8 @@ def export(settings: ExportSettings) -> Path:
         DeviceError: the device cannot be used.
     """
     result = load_result(settings.result, require_device(settings.device))
-    to, place = settings.to, settings.output or result.folder / "export" / settings.to
+    to = settings.to
+    place = settings.output or result.folder / "export" / settings.to
     name, *suffixes = _FILES.get(to, (to,))
     if to == "glb" and settings.textured:  # beside the plain one
         name = "mesh_textured.glb"
@@ -130,6 +129,8 @@ def _write_mesh(path: Path, result: SavedResult, settings: ExportSettings) -> No
         mesh.save(path)
     else:
         result.require_images()
-        views, tolerance = fusion_views(result.keyframes), TOLERANCE * median_edge(mesh)
+        views = fusion_views(result.keyframes)
+        # Largest distance of a face from a depth map that shows it, in median mesh edges.
+        tolerance = 2.0 * median_edge(mesh)
         m = texture_mesh(mesh, views, tolerance, settings.texture_size)
         write_textured_glb(path, m.vertices, m.faces, m.normals, m.uv, m.texture)

@@ -49,7 +49,8 @@ def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None
         OutputError: a file cannot be written.
     """
     images = _write_images(folder, result)
-    unit, masked = _nerfstudio_unit(result), []
+    unit = _nerfstudio_unit(result)
+    masked = []
     for number, image in enumerate(images):
         name = Path(image.name).with_suffix(".png").name
         mask = result.image_mask(number)
@@ -86,11 +87,17 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
         for id, T in zip(result.views.keyframe_id, result.views.T_cw, strict=True)
     }
     layouts: dict[str, object] = {
-        "depth": {"png": f"z along the optical axis in steps of {unit:g} map units, 0 unknown",
-                  "png_unit": unit, "npz": "the same in map units"},
-        "normals": {"png": f"2 v / {STEPS} - 1 of red, green, blue is x, y, z; black is unknown",
-                    "npz": "x, y, z", "frame": "camera: x right, y down, z forward"},
-    }  # fmt: skip
+        "depth": {
+            "png": f"z along the optical axis in steps of {unit:g} map units, 0 unknown",
+            "png_unit": unit,
+            "npz": "the same in map units",
+        },
+        "normals": {
+            "png": f"2 v / {STEPS} - 1 of red, green, blue is x, y, z; black is unknown",
+            "npz": "x, y, z",
+            "frame": "camera: x right, y down, z forward",
+        },
+    }
     metadata = {"values": layouts[kind], "T_cw": poses}
     write_description(folder / "description.json", result.camera, metadata)
 
@@ -112,10 +119,12 @@ def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:
 def _maps(number: int, result: SavedResult) -> tuple[np.ndarray, np.ndarray]:
     """Depth and normals of a keyframe inside its mask, at the size of its image."""
     maps = result.renderer.surface(torch.from_numpy(result.views.T_cw[number]), result.camera)
-    depth, normal = maps.depth.cpu().numpy(), maps.normal.cpu().numpy()
+    depth = maps.depth.cpu().numpy()
+    normal = maps.normal.cpu().numpy()
     mask = result.image_mask(number)
     if mask is not None:
-        depth, normal = np.where(mask, depth, 0), np.where(mask[..., None], normal, 0)
+        depth = np.where(mask, depth, 0)
+        normal = np.where(mask[..., None], normal, 0)
     return depth.astype(np.float32), normal.astype(np.float32)
 
 

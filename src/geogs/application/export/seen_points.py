@@ -13,10 +13,6 @@ from geogs.geometry.lie import transform
 from geogs.io.writers.exports.exported import SeenPoints
 from geogs.types import RenderedKeyframe
 
-AGREEMENT = 0.01
-"""Largest relative difference of depth for a keyframe to see a point."""
-_MIN_COSINE = 0.1
-
 
 def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: int) -> SeenPoints:
     """About ``count`` points from the keyframes' depths that two keyframes or more see.
@@ -42,9 +38,13 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
     own = keyframes[0].camera
     scale = size / np.array([own.width, own.height])
     return SeenPoints(
-        positions[kept], normals[kept].astype(np.float32), colours[kept], number[point[stays]],
-        image[stays].astype(np.int64), (at[stays] + 0.5) * scale - 0.5,
-    )  # fmt: skip
+        positions[kept],
+        normals[kept].astype(np.float32),
+        colours[kept],
+        number[point[stays]],
+        image[stays].astype(np.int64),
+        (at[stays] + 0.5) * scale - 0.5,
+    )
 
 
 def cloud(keyframes: Sequence[RenderedKeyframe]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -94,7 +94,8 @@ def _lifted(
     """World positions and normals of some pixels, and their colours in the image."""
     if keyframe.image is None:
         raise InputError("The result was written without keyframe images, which this needs.")
-    camera, T_cw = keyframe.camera, keyframe.T_cw.numpy()
+    camera = keyframe.camera
+    T_cw = keyframe.T_cw.numpy()
     v, u = np.divmod(pixels, camera.width)
     z = keyframe.depth.cpu().numpy()[v, u].astype(np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
@@ -110,15 +111,17 @@ def _observed(
     positions: Float64[np.ndarray, "n 3"], normals: np.ndarray, keyframe: RenderedKeyframe
 ) -> tuple[Int64[np.ndarray, "k"], Float64[np.ndarray, "k 2"]]:
     """Indices of the points that a keyframe sees, and their pixels in its depth map."""
-    camera, T_cw = keyframe.camera, keyframe.T_cw
+    camera = keyframe.camera
+    T_cw = keyframe.T_cw
     points = transform(T_cw, torch.from_numpy(positions))
     pixels, z = camera.project(points)
     u, v = pixels.round().long().unbind(-1)
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     index = inside.nonzero()[:, 0]
     depth = keyframe.depth.cpu().double()[v[index], u[index]]
-    agrees = (depth - z[index]).abs() < AGREEMENT * z[index]
-    facing = _cosines(points[index], torch.from_numpy(normals)[index], T_cw) > _MIN_COSINE
+    # Largest relative difference of depth for a keyframe to see a point.
+    agrees = (depth - z[index]).abs() < 0.01 * z[index]
+    facing = _cosines(points[index], torch.from_numpy(normals)[index], T_cw) > 0.1
     index = index[agrees & facing]
     return index.numpy(), pixels[index].numpy()
 

@@ -27,11 +27,6 @@ ON_GPU = "planes", "turn", "lens"
 """Parts for a run on a GPU, those that take longest first."""
 POSED_ON_GPU = "look", "planes"
 """Parts for known poses on a GPU."""
-_NICENESS = 5
-"""Increment of niceness from each part to the next; the run itself comes first."""
-_POLL_SECONDS = 0.05
-_OBJECTS = 100_000
-"""Threshold of garbage collection, in new objects; a compiler makes many that stay."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 
 
@@ -59,7 +54,7 @@ class Compilation:
         for done, part in enumerate(needed):
             while self._processes[part].poll() is None:
                 report("compiling, once", done / len(needed))
-                time.sleep(_POLL_SECONDS)
+                time.sleep(0.05)
         return time.perf_counter() - start
 
     def stop(self) -> None:
@@ -78,7 +73,8 @@ def compiling(device: torch.device, knows_poses: bool = False) -> Iterator[Compi
     if is_compiled(parts) or not sys.executable:
         yield Compilation()
         return
-    none, begun = subprocess.DEVNULL, {}
+    none = subprocess.DEVNULL
+    begun = {}
     for part in parts:
         command = [sys.executable, "-m", __name__, part]
         with contextlib.suppress(OSError):  # no memory, no more processes: compiled when it is used
@@ -128,9 +124,11 @@ def main(arguments: list[str]) -> None:
     parts = arguments or [*PARTS]
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # messages are not shown
     gc.freeze()
-    gc.set_threshold(_OBJECTS)
+    # Threshold of garbage collection, in new objects; a compiler makes many that stay.
+    gc.set_threshold(100_000)
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_NICENESS * (1 + [*POSED_ON_GPU, *ON_GPU, *PARTS].index(parts[0])))
+        # Increment of niceness from each part to the next; the run itself comes first.
+        os.nice(5 * (1 + [*POSED_ON_GPU, *ON_GPU, *PARTS].index(parts[0])))
     if not is_compiled(parts):
         compile_now(parts)
 

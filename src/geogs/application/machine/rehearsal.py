@@ -79,14 +79,22 @@ def _follow() -> None:
 
 def _lens() -> None:
     """Adjust two pictures with an unknown lens, and a rolling shutter."""
-    grid, times = SampleGrid(CAMERA), np.arange(VIEWS) / 30
+    grid = SampleGrid(CAMERA)
+    times = np.arange(VIEWS) / 30
     T_cw = torch.stack([torch.from_numpy(_pose(number)) for number in range(VIEWS)])
-    depth, free = torch.full((2, grid.size), 1 / DEPTH), torch.tensor([False, True])
+    depth = torch.full((2, grid.size), 1 / DEPTH)
+    free = torch.tensor([False, True])
     pixels = (grid.pixels - torch.tensor([SHIFT, 0.0]))[None]
     problem = BundleProblem(
-        T_cw[:2], depth, torch.tensor([0]), torch.tensor([1]), free, free.new_ones(2),
-        pixels=pixels, weight=torch.ones_like(pixels),
-    )  # fmt: skip
+        T_cw[:2],
+        depth,
+        torch.tensor([0]),
+        torch.tensor([1]),
+        free,
+        free.new_ones(2),
+        pixels=pixels,
+        weight=torch.ones_like(pixels),
+    )
     solve_shared(problem, LensBlock(CAMERA, grid.pixels), replace(OPTIONS, iterations=1))
     rows = RowOffsets(RollingCamera(CAMERA), CAMERA)
     seen = rows.seen(rows.nodes(AngularMotion(), 0.0), Shutter(0.02))
@@ -129,7 +137,8 @@ def _scene() -> Reconstruction:
 def _bare() -> None:
     """Fill a textureless part of the wall by a plane, from the depth at its rim."""
     depth = np.full((CAMERA.height, CAMERA.width), DEPTH, np.float32)
-    confidence, labels = np.ones_like(depth), np.zeros(depth.shape, np.int32)
+    confidence = np.ones_like(depth)
+    labels = np.zeros(depth.shape, np.int32)
     confidence[20:50, 20:70] = 0
     labels[20:50, 20:70] = 1
     on_planes(KeyframeDepth(depth, confidence), labels, None, 0)
@@ -153,7 +162,8 @@ _STEPS = {
 def _seen(number: int) -> DepthMapView:
     """The true depth map of the wall."""
     depth = torch.full((CAMERA.height, CAMERA.width), DEPTH)
-    pose, picture = torch.from_numpy(_pose(number)), _pictures()[number]
+    pose = torch.from_numpy(_pose(number))
+    picture = _pictures()[number]
     return DepthMapView(depth, torch.ones_like(depth), CAMERA, pose, picture)
 
 

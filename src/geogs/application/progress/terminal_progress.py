@@ -26,9 +26,6 @@ _LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
 _REDRAWS = 4
 """Redraws per second; drawing the line holds the interpreter's lock for milliseconds."""
 
-_PACE_SECONDS = 60.0
-"""Window for the pace of a stage, in seconds: first parts often differ."""
-
 
 class TerminalProgress(RunProgress):
     """A line on the standard error, while it is entered and from the first report on.
@@ -46,7 +43,8 @@ class TerminalProgress(RunProgress):
             TextColumn("{task.fields[left]}", style="cyan"),
             console=Console(stderr=True, quiet=self._verbosity.quiet, highlight=False),
             refresh_per_second=_REDRAWS,
-            speed_estimate_period=_PACE_SECONDS,
+            # Window for the pace of a stage, in seconds: first parts often differ.
+            speed_estimate_period=60.0,
             transient=True,
         )
         self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
@@ -54,7 +52,8 @@ class TerminalProgress(RunProgress):
         self._dropped = 0
         self._printed = self._phase_began = time.perf_counter()
         self._phase = self._stage = self._last = ""
-        self._memory, self._measured = "", -math.inf
+        self._memory = ""
+        self._measured = -math.inf
         self._log: logging.Handler | None = None
 
     def __enter__(self) -> "TerminalProgress":
@@ -123,7 +122,8 @@ class TerminalProgress(RunProgress):
         """Peak memory so far; measured no more often than the line is drawn."""
         now = time.perf_counter()
         if now - self._measured > 1 / _REDRAWS:
-            self._memory, self._measured = f"{peak_memory() / 2**30:.1f} GB", now
+            self._memory = f"{peak_memory() / 2**30:.1f} GB"
+            self._measured = now
         return self._memory
 
     def stage(self, name: str, fraction: float) -> None:
@@ -136,7 +136,8 @@ class TerminalProgress(RunProgress):
         if phase == self._phase:
             return
         self.end_phase()
-        self._phase, self._phase_began = phase, time.perf_counter()
+        self._phase = phase
+        self._phase_began = time.perf_counter()
         self._printed = self._phase_began
 
     def end_phase(self) -> None:

@@ -41,7 +41,10 @@ def write_keyframes(
     Raises:
         OutputError: a file cannot be written.
     """
-    ids, times, poses, masked = [], [], [], []
+    ids = []
+    times = []
+    poses = []
+    masked = []
     for render in renders:
         ids.append(render.keyframe_id)
         times.append(render.timestamp)

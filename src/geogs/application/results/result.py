@@ -77,9 +77,12 @@ class Result:
         source = self.source
         said = source.calibration.refinement if isinstance(source, Source) else None
         return verdict(
-            self.trajectory, self.keyframes, self.uncertainty, self.why_no_map or "",
+            self.trajectory,
+            self.keyframes,
+            self.uncertainty,
+            self.why_no_map or "",
             said is None or said.is_explained,
-        )  # fmt: skip
+        )
 
     @property
     def why_no_map(self) -> str | None:

@@ -23,7 +23,7 @@ from geogs.evaluation.model_view.shown_model import (
     SurfaceModel,
 )
 from geogs.evaluation.model_view.start_view import StartView, start_view
-from geogs.evaluation.pages.lengths import lengths
+from geogs.evaluation.pages.run_page import lengths, write_run_page
 from geogs.geometry.camera import Camera
 from geogs.mesh.decimation.decimate import with_at_most
 from geogs.mesh.triangle_mesh import Mesh
@@ -84,11 +84,10 @@ def write_page(
     Raises:
         OutputError: a file cannot be written.
     """
-    from geogs.evaluation.pages.run_page import write_run_page
-
     model = None
     if renders:
-        views, camera = _rendered_views(renders), renders[0].camera
+        views = _rendered_views(renders)
+        camera = renders[0].camera
         model = shown_model(trajectory, views, camera, mesh, disks, lengths(summary))
     write_run_page(folder, summary, model)
 
@@ -108,8 +107,6 @@ def write_page_anew(
         InputError: the result is damaged.
         OutputError: it cannot be written.
     """
-    from geogs.evaluation.pages.run_page import write_run_page
-
     if not (result.folder / "summary.json").is_file() or not (result.folder / "report").is_dir():
         return
     trajectory = result.trajectory if trajectory is None else trajectory
@@ -166,7 +163,10 @@ def shown_model(
         more_colourings: further colourings of the shown surface, besides the images' colours.
         true_path: positions of the true camera, in the frame of the map.
     """
-    notes, surface, seen, disk_model = [], None, None, None
+    notes = []
+    surface = None
+    seen = None
+    disk_model = None
     if mesh is not None and len(mesh.faces):
         surface = _surface(with_at_most(mesh, MAX_FACES), more_colourings)
         if len(surface.faces) < len(mesh.faces):

@@ -164,7 +164,8 @@ class SavedResult:
 
     def image_mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
         """The mask of a keyframe at the size of its image; none if it has none."""
-        mask, size = self.mask(number), (self.camera.width, self.camera.height)
+        mask = self.mask(number)
+        size = (self.camera.width, self.camera.height)
         if mask is None:
             return None
         return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
@@ -173,7 +174,8 @@ class SavedResult:
     def _keyframe(self, number: int) -> RenderedKeyframe:
         views = self.views
         number = range(len(views.keyframe_id))[number]
-        id, mask = int(views.keyframe_id[number]), None
+        id = int(views.keyframe_id[number])
+        mask = None
         T_cw = torch.from_numpy(views.T_cw[number])
         if (stored := self.mask(number)) is not None:
             mask = torch.from_numpy(stored).to(self.disks.position.device)

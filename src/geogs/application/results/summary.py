@@ -22,12 +22,15 @@ if TYPE_CHECKING:
 
 def summarise(result: Result) -> dict[str, object]:
     """Content of ``summary.json``."""
-    scene, source, mesh = result.scene, result.source, result.mesh
+    scene = result.scene
+    source = result.source
+    mesh = result.mesh
     return {
         "source": source.name,
         "kind": source.kind,
         "fingerprint": source.fingerprint(),
         "frames": scene.frames,
+        "input": {"found": source.found, **asdict(source.account)},
         **source_summary(source),
         "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
         "keyframes": len(result.keyframes.timestamps),
@@ -74,6 +77,7 @@ def source_summary(source: Source | PosedSource) -> dict[str, object]:
         return {
             "scale": f"of the poses ({source.scene_scale})",
             "skipped_images": len(left_out),
+            **({"pose_check": source.pose_error} if source.pose_error else {}),
             **({"left_out": left_out} if left_out else {}),
             **held_out,
         }
@@ -108,6 +112,7 @@ def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
 def state_spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:
     """First and last time of each span of frames in a state."""
     inside = np.array([False, *(s == state for s in trajectory.states), False]).astype(int)
-    first, last = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1) - 1
+    first = np.flatnonzero(np.diff(inside) == 1)
+    last = np.flatnonzero(np.diff(inside) == -1) - 1
     times = trajectory.timestamps
     return [[float(times[a]), float(times[b])] for a, b in zip(first, last, strict=True)]

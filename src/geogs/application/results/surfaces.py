@@ -1,25 +1,35 @@
-"""Mesh files: of the result, of earlier stages, and of depths without disks."""
+"""Mesh files: of the result, of earlier stages, of depths without disks, and a preview."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import torch
 
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.io.writers.map_file import save_map
+from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.on_demand import OnDemand
+from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe
 
 if TYPE_CHECKING:
     from geogs.application.results.mapped_scene import MappedScene
     from geogs.reconstruction import Reconstruction
+    from geogs.slam import Slam
+    from geogs.world.keyframes import Keyframe
+
+
+PREVIEW = "preview.ply"
 
 
 def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
@@ -119,7 +129,8 @@ class Snapshots:
     def take(self, scene: "Reconstruction") -> None:
         """Copy the disks if a time has passed; without disks yet there is no copy."""
         while self._due and scene.elapsed >= self._due[0]:
-            disks, seconds = scene.snapshot(), self._due.pop(0)
+            disks = scene.snapshot()
+            seconds = self._due.pop(0)
             if len(disks):
                 self._kept[seconds] = disks
             else:
@@ -140,3 +151,45 @@ class Snapshots:
                 name = f"mesh at {seconds:g} s"
                 renders = scene.renders(disks)
                 write_surface(folder / "mesh.ply", renders, scene.config.mesh, progress, name)
+
+
+def write_preview(output: Path, slam: "Slam") -> bool:
+    """Write ``preview.ply``: the surface of the depths of tracking.
+
+    It is deleted when the final result is written. Returns whether there is one.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    mesh = preview(slam)
+    if mesh is None:
+        return False
+    with replaced(output, "part") as new:
+        mesh.save(new / PREVIEW)
+    return True
+
+
+@on_one_torch_thread
+def preview(slam: "Slam") -> Mesh | None:
+    """The surface of the depths of tracking, one per 64 pixels; none without any."""
+    keyframes = slam.segments.main.segment.keyframes
+    stride = -(-max(len(keyframes), 1) // 60)  # at most 60 views, evenly spread
+    camera = slam.camera
+    # A cell of the tracker has eight pixels, so 128 along the longer side show all of it.
+    shrink = min(128 / max(camera.width, camera.height), 1.0)
+    small = camera.resized(round(shrink * camera.width), round(shrink * camera.height))
+    views = OnDemand(list(keyframes)[::stride], lambda k: _view(k, camera, small))
+    # One such coarse depth alone makes no surface: a voxel needs more weight than one view gives.
+    rough = replace(slam.config.mesh, voxel=None, triangle_budget=60_000, min_weight=1.5)
+    try:
+        return extract_mesh(views, rough)
+    except InputError:  # too little surface is known; the full map may have more
+        return None
+
+
+def _view(keyframe: "Keyframe", working: Camera, small: Camera) -> DepthMapView:
+    from geogs.depth.tracker_depth import enlarged_depth  # loads SciPy, seldom needed
+
+    found = enlarged_depth(*keyframe.depth_field(), working, small)
+    depth, weight = (torch.from_numpy(m) for m in (found.depth, found.confidence))
+    return DepthMapView(depth, weight, small, keyframe.T_cw, keyframe.image)

@@ -7,34 +7,12 @@ import numpy as np
 from geogs.evaluation.trajectory_errors import extent_of
 from geogs.types import Trajectory, Uncertainty
 
-MAX_LOST = 0.2
-"""Largest fraction of frames without a pose in a reliable result."""
-MAX_ORIENTATION_ONLY = 0.5
-"""Largest fraction of frames with only an orientation in a reliable result: with more, the map is
-right, but covers little of the video."""
 MAX_POSITION_DEVIATION = 0.05
 """Largest standard deviation of the camera position, relative to the path's extent."""
-MAX_DEPTH_DEVIATION = 0.2
-"""Largest relative standard deviation of the best known depths."""
-MAX_FOCAL_DEVIATION = 0.15
-"""Largest relative deviation of the focal length, whose error makes the scene too wide or narrow:
-14 % and less in rendered videos where it was right (docs/notebook/lens.md)."""
-MAX_MISFIT = 1.35
-"""Largest ratio of the residuals of a tenth of the keyframes to the others': up to 1.29 in rendered
-videos with correct tracking, from 1.41 on where it had failed (docs/notebook/uncertainty.md)."""
-MAX_FOCAL_CHANGE = 0.05
-"""Largest relative difference of the focal lengths estimated from parts of a video
-(docs/notebook/uncertainty.md)."""
-MAX_LENS_CHANGE = 0.1
-"""Largest reduction of the matches' cost by per-frame lenses, as a fraction; below 0.06 for a
-constant lens (docs/notebook/lens.md)."""
-MAX_LENS_CHANGE_LEFT = 0.03
-"""The same where per-frame lenses were estimated: up to 0.024 where they are right, from 0.046 on
-where the map was wrong from its start (docs/notebook/lens.md)."""
-MIN_JOINED = 0.95
-"""Least fraction of keyframes in one rigid structure; a few of the others may be misplaced."""
-NO_SHAPE = 0.5
-"""Relative deviation of the best known depths from which on there is no evidence of a surface."""
+MAX_SHAPE_DEVIATION = 0.15
+"""Largest relative standard deviation of the best known depths, and of the focal length, whose
+error makes the scene too wide or narrow: 14 % and less in rendered videos where it was right, from
+16 % on where it was wrong (docs/notebook/lens.md)."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +47,7 @@ class Verdict:
     @property
     def has_shape(self) -> bool:
         """Whether depths are accurate enough for a surface."""
-        return self.depth < NO_SHAPE
+        return self.depth < 0.5
 
 
 def verdict(
@@ -98,71 +76,89 @@ def verdict(
         nothing = float("inf")
         return Verdict(False, sentence, lost, orientation_only, nothing, nothing, nothing)
     position = _median(known.position) / max(extent, 1e-12)
-    depth, rotation = _median(known.depth), float(np.degrees(_median(known.rotation)))
-    reasons = []
-    if lost > MAX_LOST:
-        reasons.append(f"{lost:.0%} of the frames are lost")
-    if orientation_only > MAX_ORIENTATION_ONLY:
-        reasons.append(f"{orientation_only:.0%} of the frames have an orientation but no position")
-    if not position <= MAX_POSITION_DEVIATION:
-        known_to = "the expected position error is {:.0%} of the path's size"
-        reasons.append(_known_to(position, known_to, "positions could not be determined"))
-    if not depth <= MAX_DEPTH_DEVIATION:
-        known_to = "the expected error of the best depths is {:.0%}"
-        reasons.append(_known_to(depth, known_to, "depths could not be determined"))
-    if not known.focal <= MAX_FOCAL_DEVIATION:
-        known_to = "the focal length is uncertain by {:.0%}"
-        focal = _known_to(known.focal, known_to, "the focal length could not be estimated")
-        reasons.append(f"{focal}: give --intrinsics")
-    elif not is_explained:
-        reasons.append(
+    depth = _median(known.depth)
+    rotation = float(np.degrees(_median(known.rotation)))
+    # A constant lens explains all but 0.06 of the cost, estimated per-frame lenses all but 0.024
+    # where they are right, and all but 0.046 where the map is wrong (docs/notebook/lens.md).
+    is_changing = known.lens_change > (0.03 if known.lens_varies else 0.1)
+    checks = [
+        (lost <= 0.2, f"{lost:.0%} of the frames are lost"),
+        (  # With more, the map is right, but covers little of the video.
+            orientation_only <= 0.5,
+            f"{orientation_only:.0%} of the frames have an orientation but no position",
+        ),
+        (
+            position <= MAX_POSITION_DEVIATION,
+            _expected(position, "position error is {:.0%} of the path's size", "positions"),
+        ),
+        (
+            depth <= MAX_SHAPE_DEVIATION,
+            _expected(depth, "error of the best depths is {:.0%}", "depths"),
+        ),
+        (
+            known.focal <= MAX_SHAPE_DEVIATION,
+            f"the focal length is uncertain by {known.focal:.0%}: give --intrinsics"
+            if known.focal < 10
+            else "the focal length could not be estimated: give --intrinsics",
+        ),
+        (
+            is_explained or known.focal > MAX_SHAPE_DEVIATION,
             "no camera explains the motion at the start, perhaps because much of the view moves: "
-            "give --intrinsics"
-        )
-    if known.focal_change > MAX_FOCAL_CHANGE:
-        reasons.append(
+            "give --intrinsics",
+        ),
+        (
+            known.focal_change <= 0.05,
             f"the focal length differs by {known.focal_change:.0%} between parts of the video, as "
-            "with a zoom"
-        )
-    most = MAX_LENS_CHANGE_LEFT if known.lens_varies else MAX_LENS_CHANGE
-    is_changing = known.lens_change > most
-    if is_changing:
-        reasons.append(
+            "with a zoom",
+        ),
+        (
+            not is_changing,
             "the lens changes from image to image (stabilisation, focus, zoom), and the change "
-            "could not be estimated"
-        )
-    if known.misfit > MAX_MISFIT:
-        reasons.append(
+            "could not be estimated",
+        ),
+        (  # Up to 1.29 in rendered videos with correct tracking, from 1.41 on where it had failed.
+            known.misfit <= 1.35,
             f"a tenth of the keyframes fit their matches {known.misfit:.1f} times worse than the "
-            "others, as when tracking fails"
-        )
-    if known.joined < MIN_JOINED:
-        reasons.append(
+            "others, as when tracking fails",
+        ),
+        (
+            known.joined >= 0.95,
             f"only {known.joined:.0%} of the keyframes form one rigid structure, as when something "
-            "fills the view"
-        )
+            "fills the view",
+        ),
+    ]
+    reasons = [reason for is_good, reason in checks if not is_good]
     if reasons:
         sentence = f"Not reliable: {'; '.join(reasons)}."
     else:
+        # A small fraction is given with its first digit.
+        percent = f"{position:.1%}" if position >= 0.001 else f"{100 * position:.1g}%"
         sentence = (
             "Trajectory and shape are reliable. Expected position error: "
-            f"{_finely(position)} of the path's size. Expected depth error: {depth:.1%}."
+            f"{percent} of the path's size. Expected depth error: {depth:.1%}."
         )
     return Verdict(
-        not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal,
-        known.focal_change, known.lens_change, known.joined, known.lens_varies or is_changing,
-    )  # fmt: skip
+        is_reliable=not reasons,
+        sentence=sentence,
+        lost=lost,
+        orientation_only=orientation_only,
+        position=position,
+        rotation_deg=rotation,
+        depth=depth,
+        focal=known.focal,
+        focal_change=known.focal_change,
+        lens_change=known.lens_change,
+        joined=known.joined,
+        lens_varies=known.lens_varies or is_changing,
+    )
 
 
 def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else float("inf")
 
 
-def _finely(value: float) -> str:
-    """Format a fraction in percent; a small one with its first digit."""
-    return f"{value:.1%}" if value >= 0.001 else f"{100 * value:.1g}%"
-
-
-def _known_to(deviation: float, known: str, unknown: str) -> str:
-    """The clause ``known`` or, where a deviation is too large to mean anything, ``unknown``."""
-    return known.format(deviation) if deviation < 10 else unknown
+def _expected(deviation: float, error: str, what: str) -> str:
+    """The expected error, unless it is too large to mean anything."""
+    if deviation < 10:
+        return f"the expected {error.format(deviation)}"
+    return f"{what} could not be determined"

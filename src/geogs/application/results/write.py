@@ -53,7 +53,9 @@ def write_files(
     Raises:
         OutputError: a file cannot be written.
     """
-    scene, source, progress = result.scene, result.source, result.progress
+    scene = result.scene
+    source = result.source
+    progress = result.progress
     write_trajectories(output, result.trajectory, result.keyframes)
     if result.uncertainty is not None:
         table = output / "trajectory_uncertainty.csv"
@@ -61,7 +63,8 @@ def write_files(
     as_it_came = () if isinstance(source, PosedSource) else (source.calibration, source.shutter)
     write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
-    disks, shown = result.map, result.renders
+    disks = result.map
+    shown = result.renders
     renders = shown if result.why_no_map is None else ()
     with ThreadPoolExecutor(2, thread_name_prefix="files") as threads:
         written = threads.submit(_write_map, output, result, renders, keyframe_images)
@@ -89,7 +92,9 @@ def _write_map(
     output: Path, result: Result, renders: Sequence[RenderedKeyframe], keyframe_images: bool
 ) -> None:
     """Write keyframes, map and splats, in parallel to the mesh."""
-    scene, source, disks = result.scene, result.source, result.map
+    scene = result.scene
+    source = result.source
+    disks = result.map
     with scene.stopwatch.aside():
         if result.why_no_map is None:
             views = write_keyframes(output, scene, source.camera, renders, keyframe_images)

@@ -48,10 +48,7 @@ class MeasurableScene:
 
 
 def measurable(
-    camera: Camera,
-    renderer: MapRenderer,
-    keyframes: Sequence[SeenKeyframe],
-    trajectory: Trajectory,
+    camera: Camera, renderer: MapRenderer, keyframes: Sequence[SeenKeyframe], trajectory: Trajectory
 ) -> MeasurableScene:
     """Make a scene of ``renderer``'s map and its keyframes, whose images are of ``camera``."""
 

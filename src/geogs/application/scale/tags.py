@@ -18,9 +18,6 @@ MIN_PARALLAX = np.radians(1.5)
 """Least angle between two rays to a corner."""
 MAX_REPROJECTION_ERROR = 3.0
 """Largest reprojection error of a triangulated corner, in pixels."""
-_COMMON_ERROR = 0.003
-"""Common relative error of all tag sizes, by printing, focal length and blur."""
-_ROUNDS = 4
 
 Corners = Float64[np.ndarray, "4 2"]
 Sighting = tuple[Float64[np.ndarray, "4 4"], Corners]
@@ -58,7 +55,8 @@ def scale_by_tags(scene: MeasurableScene, known: TagSize) -> MetricScale:
         found = _sides(points)
         sizes += found
         if found:
-            tags, views = tags + 1, views + len(sightings)
+            tags = tags + 1
+            views = views + len(sightings)
     if not sizes:
         what = f"seen, but in too few places ({len(seen)} of them)" if seen else "found"
         raise InputError(
@@ -67,7 +65,8 @@ def scale_by_tags(scene: MeasurableScene, known: TagSize) -> MetricScale:
         )
     middle = float(np.median(sizes))
     spread = 1.4826 * float(np.median(np.abs(np.array(sizes) - middle))) / middle
-    deviation = float(np.hypot(spread / max(tags, 1) ** 0.5 / 2, _COMMON_ERROR))
+    # Common relative error of all tag sizes, by printing, focal length and blur.
+    deviation = float(np.hypot(spread / max(tags, 1) ** 0.5 / 2, 0.003))
     origin = f"{tags} tag{'s' * (tags > 1)} of {known.metres:g} m in {views} sightings"
     return MetricScale(origin, known.metres / middle, deviation)
 
@@ -166,7 +165,7 @@ def triangulated(
     used = np.ones(len(P), bool)
     depth = np.ones(len(P))
     point = np.zeros(3)
-    for _ in range(_ROUNDS):
+    for _ in range(4):
         if used.sum() < 2:
             return None
         A = np.concatenate(

@@ -25,12 +25,6 @@ from geogs.types import FoundFrames, Frame, Trajectory, Uncertainty
 
 NEIGHBOURS = 10
 """Number of located frames before each lost one, and after it, that are used to find it."""
-MAX_LOST = 250
-"""Largest number of lost frames in one search, for time and memory; if there are more, every second
-one comes first, or every third, ..."""
-FACTOR_WITHOUT_READOUT = 3.0
-"""Factor on standard deviations where the readout is unknown, so rows were not rectified.
-Measured on a phone's video with a truth (docs/notebook/photographs.md)."""
 STAGE = "lost frames"
 
 
@@ -57,10 +51,13 @@ class LostFrames:
             seed: seed of the random choices.
         """
         # A copy, as a source keeps its reading position.
-        self._video, self._views, self._seed = copy.copy(video), views, seed
+        self._video = copy.copy(video)
+        self._views = views
+        self._seed = seed
         self._most_deviation = MAX_POSITION_DEVIATION * extent_of(keyframes.T_wc)
         self._times = trajectory.timestamps
-        states, T_wc = trajectory.states, trajectory.T_wc
+        states = trajectory.states
+        T_wc = trajectory.T_wc
         self.known = {k: np.linalg.inv(T_wc[k]) for k in sharp if states[k] == "tracked"}
         """World-to-camera poses of the reference frames."""
         self.numbers = [k for k, state in enumerate(states) if state != "tracked"]
@@ -91,7 +88,10 @@ class LostFrames:
         return found
 
     def _found(self, report: StageProgress) -> FoundFrames:
-        known, rounds = dict(self.known), math.ceil(len(self.numbers) / MAX_LOST)
+        known = dict(self.known)
+        # For time and memory, at most 250 are searched at once: of more, every second one first, or
+        # every third, ...
+        rounds = math.ceil(len(self.numbers) / 250)
         at = np.array([self._times[k] for k in sorted(known)])
         beside = Uncertainty(at, *np.zeros((3, len(at))))
         poses: dict[int, Float64[np.ndarray, "4 4"]] = {}
@@ -102,7 +102,8 @@ class LostFrames:
             known |= poses
         numbers = tuple(sorted(poses))
         times = np.array([self._times[k] for k in numbers])
-        own, T_cw = beside.at(times), np.array([poses[k] for k in numbers]).reshape(-1, 4, 4)
+        own = beside.at(times)
+        T_cw = np.array([poses[k] for k in numbers]).reshape(-1, 4, 4)
         return FoundFrames(numbers, times, T_cw, own.position, own.rotation)
 
     def _find(
@@ -117,9 +118,12 @@ class LostFrames:
             return FoundFrames.none()
         frames = _read(self._video, {*wanted, *near})
         frames = [replace(f, image=self._views.alike(f.index, f.image)) for f in frames]
-        T_cw, view = [known.get(frame.index) for frame in frames], self._views.view
+        T_cw = [known.get(frame.index) for frame in frames]
+        view = self._views.view
         found = place_lost(frames, T_cw, as_seen(view), self._seed, report)
-        times = 1.0 if self._video.shutter.is_told else FACTOR_WITHOUT_READOUT
+        # Factor on standard deviations where the readout is unknown, so rows were not rectified.
+        # Measured on a phone's video with a truth (docs/notebook/photographs.md).
+        times = 1.0 if self._video.shutter.is_told else 3.0
         # A lost frame's own lens change acts like a rotation, and is not known from keyframes.
         rotation = np.hypot(times * found.rotation, math.sqrt(2) * view.lens.varies_centre)
         found = replace(found, position=times * found.position, rotation=rotation)
@@ -128,7 +132,8 @@ class LostFrames:
 
 def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
     """Known frames nearest to any wanted one, before and after it."""
-    near, ascending = set[int](), sorted(known)
+    near = set[int]()
+    ascending = sorted(known)
     for number in wanted:
         at = bisect_left(ascending, number)
         near.update(ascending[max(0, at - NEIGHBOURS) : at + NEIGHBOURS])
@@ -137,7 +142,8 @@ def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
 
 def as_seen(view: StraightView) -> Calibration:
     """Calibration of the working images, with the distortion that was estimated since."""
-    camera, bend = view.seen_by, view.distortion if any(view.distortion) else ()
+    camera = view.seen_by
+    bend = view.distortion if any(view.distortion) else ()
     return Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, bend, width=camera.width, height=camera.height
     )
@@ -145,7 +151,8 @@ def as_seen(view: StraightView) -> Calibration:
 
 def _read(video: Source, numbers: Collection[int]) -> list[Frame]:
     """Some frames of a video, in time order."""
-    frames, last = list[Frame](), max(numbers)
+    frames = list[Frame]()
+    last = max(numbers)
     with closing(iter(video)) as stream:
         for frame in stream:
             if frame.index in numbers:

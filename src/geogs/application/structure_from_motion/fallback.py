@@ -5,29 +5,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.results.result import Result
-from geogs.application.results.verdict import (
-    MAX_DEPTH_DEVIATION,
-    MAX_POSITION_DEVIATION,
-    Verdict,
-)
+from geogs.application.results.verdict import MAX_POSITION_DEVIATION, MAX_SHAPE_DEVIATION, Verdict
 from geogs.application.run_settings import RunSettings
-from geogs.application.structure_from_motion.agreement import has_wrong_joint, rotations_agree
 from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
 from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.errors import InputError, TrackingLost
+from geogs.evaluation.rotation_errors import relative_rotation_error, rotation_angle
 from geogs.io.sources.frame_source import Source
 from geogs.slam import Slam
-from geogs.types import FoundFrames
+from geogs.types import FoundFrames, Trajectory
 
 if TYPE_CHECKING:
     from geogs.application.structure_from_motion.offline import PlacedOffline
+
 
 MAX_UNKNOWN = 0.1
 """Fraction of lost frames above which structure from motion is tried."""
@@ -46,7 +45,8 @@ class TrackedOrPlaced(Work):
 
     def __init__(self, tracked: TrackedVideo, opened: Source) -> None:
         """``opened`` is the video before the run's self-calibration."""
-        self._tracked, self._opened = tracked, opened
+        self._tracked = tracked
+        self._opened = opened
         self._take(tracked)
 
     @property
@@ -63,11 +63,13 @@ class TrackedOrPlaced(Work):
 
         Raises TrackingLost if no frame could be tracked or located.
         """
-        tracked, failure = self._tracked, None
+        tracked = self._tracked
+        failure = None
         try:
             outcome = tracked.locate(driver, checkpoint, new)
         except TrackingLost as error:
-            outcome, failure = Outcome.FINISHED, error
+            outcome = Outcome.FINISHED
+            failure = error
         if outcome is Outcome.FINISHED:
             judged = None if failure else self._judged(driver)
             if is_wanted(judged):
@@ -99,14 +101,16 @@ class TrackedOrPlaced(Work):
 
     def _find_lost(self, driver: Driver, result: Result) -> bool:
         """Locate lost frames by the keyframes. Returns whether any was found."""
-        slam, source, stop = self._tracked.scene, self._tracked.source, driver.stop
+        slam = self._tracked.scene
+        source = self._tracked.source
+        stop = driver.stop
         may = self._tracked.metadata.settings.fallback and not source.is_live and has_pycolmap()
         if not may or stop.requested:
             return False
         keyframes = [slam.world.keyframes[i].frame_index for i in slam.segments.main.segment.free]
         lost = LostFrames(
             source, _views(slam), result.trajectory, keyframes, result.keyframes, slam.config.seed
-        )  # fmt: skip
+        )
         found = FoundFrames.none()
 
         def find() -> None:
@@ -119,11 +123,13 @@ class TrackedOrPlaced(Work):
         return len(found) > 0
 
     def _take(self, work: "TrackedVideo | PlacedOffline") -> None:
-        self.scene, self.source = work.scene, work.source
+        self.scene = work.scene
+        self.source = work.source
 
     def _placed(self, driver: Driver, tracked: Verdict | None) -> "PlacedOffline | None":
         """Locate the frames by structure from motion and report it; none if impossible or worse."""
-        say, settings = driver.progress.write, self._tracked.metadata.settings
+        say = driver.progress.write
+        settings = self._tracked.metadata.settings
         if not settings.fallback:
             return None
         why_not = impossible(settings, self._opened)
@@ -157,7 +163,8 @@ class TrackedOrPlaced(Work):
         return placed if is_taken else None
 
     def _rotates_otherwise(self, placed: "PlacedOffline") -> bool:
-        was, sharp = self._tracked.scene.trajectory(), placed.scene.keyframe_trajectory()
+        was = self._tracked.scene.trajectory()
+        sharp = placed.scene.keyframe_trajectory()
         return not rotations_agree(was, placed.trajectory) or has_wrong_joint(was, sharp)
 
     def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
@@ -205,9 +212,11 @@ def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
     determine the depths, as many are not enough: it has more matches, and its standard deviations
     of depths include the uncertainty of lens and rows.
     """
-    position, depth = MAX_POSITION_DEVIATION, MAX_DEPTH_DEVIATION
+    position = MAX_POSITION_DEVIATION
+    depth = MAX_SHAPE_DEVIATION
     if tracked is not None:
-        position, depth = max(position, tracked.position), max(depth, tracked.depth)
+        position = max(position, tracked.position)
+        depth = max(depth, tracked.depth)
     if not (placed.position <= position and placed.depth <= depth and placed.has_shape):
         return False
     more = _placed_part(placed) - _placed_part(tracked)
@@ -228,14 +237,15 @@ def impossible(settings: RunSettings, source: Source) -> str:
 
 def _views(slam: Slam) -> FrameViews:
     """Undistortion of a tracked video's frames by the lens of the adjustment."""
-    table, camera = slam.world.keyframes, slam.camera
+    table = slam.world.keyframes
+    camera = slam.camera
     own = {table[id].frame_index: lens for id, lens in table.frame_lenses.items()}
     lens = slam.lens
     return FrameViews(StraightView(camera, lens) if lens else StraightView.of_pinhole(camera), own)
 
 
 def _is_shape_known(judged: Verdict) -> bool:
-    return judged.depth <= MAX_DEPTH_DEVIATION
+    return judged.depth <= MAX_SHAPE_DEVIATION
 
 
 def _placed_part(judged: Verdict | None) -> float:
@@ -244,3 +254,45 @@ def _placed_part(judged: Verdict | None) -> float:
 
 def _in_words(tracked: Verdict | None) -> str:
     return "No frame could be tracked." if tracked is None else tracked.sentence
+
+
+FRAMES_APART = 5
+"""Distance of the frames of a pair, counted in frames located by both trajectories."""
+
+
+def rotations_agree(first: Trajectory, second: Trajectory) -> bool:
+    """Whether the rotations of most frame pairs agree, or there are too few pairs.
+
+    A wrong start may misplace the camera, but hardly its rotation between frames: a trajectory with
+    other rotations than the tracked ones is wrong, however small its standard deviations. Frames
+    are matched by their times; those count that both trajectories located.
+    """
+    known = first.of("tracked"), second.of("tracked")
+    _, R = _common(*known)
+    begin = np.arange(len(R[0]) - FRAMES_APART)
+    if len(begin) < 10:  # too few for a test
+        return True
+    end = begin + FRAMES_APART
+    difference = relative_rotation_error(R[1], R[0], begin, end)
+    angle = rotation_angle(R[0][begin], R[0][end])
+    # Rotations may differ by a degree, and by a fraction: wrong focal lengths scale them.
+    return bool((difference <= 1.0 + 0.15 * angle).mean() > 0.5)
+
+
+def has_wrong_joint(tracked: Trajectory, sharp: Trajectory) -> bool:
+    """Whether the rotation between two consecutive sharp frames differs much from tracking, which
+    lost no frame between them."""
+    times, R = _common(tracked.of("tracked"), sharp)
+    number = np.searchsorted(tracked.timestamps, times)
+    lost = np.cumsum([state != "tracked" for state in tracked.states])[number]
+    begin = np.flatnonzero(np.diff(lost) == 0)
+    # Largest difference of the rotations between two consecutive frames in degrees.
+    return bool((relative_rotation_error(R[1], R[0], begin, begin + 1) > 30.0).any())
+
+
+def _common(
+    first: Trajectory, second: Trajectory
+) -> tuple[Float64[np.ndarray, "n"], list[Float64[np.ndarray, "n 3 3"]]]:
+    """Times of the common frames, and their orientations by each trajectory."""
+    times, *rows = np.intersect1d(first.timestamps, second.timestamps, return_indices=True)
+    return times, [k.T_wc[row, :3, :3] for k, row in zip((first, second), rows, strict=True)]

@@ -13,11 +13,7 @@ from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames, choose_frames
 from geogs.application.structure_from_motion.completion import LostFrames
-from geogs.application.structure_from_motion.photos import (
-    PlacedVideo,
-    localiser,
-    place_frames,
-)
+from geogs.application.structure_from_motion.photos import PlacedVideo, localiser, place_frames
 from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_preset
 from geogs.geometry.camera import Camera
@@ -31,12 +27,6 @@ from geogs.types import FoundFrames, Trajectory, Uncertainty
 MIN_READOUT_FPS = 8.0
 """Recorded frame rate below which a readout estimated before the run is not used: structure from
 motion estimates its own by residuals (docs/photographs.md)."""
-
-
-def offline_config(config: Config) -> ReconstructConfig:
-    """Mapping settings for frames located by structure from motion, from the settings of a run."""
-    made = reconstruct_preset(preset_of(config))
-    return replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
 
 
 class PlacedOffline(Work):
@@ -55,7 +45,8 @@ class PlacedOffline(Work):
 
     def __init__(self, config: Config, video: Source, stopwatch: Stopwatch | None = None) -> None:
         """``config`` is that of a run; a ``stopwatch`` may have run before."""
-        self._config = offline_config(config)
+        made = reconstruct_preset(preset_of(config))
+        self._config = replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
         self.source = video
         self._stopwatch = stopwatch or Stopwatch()
         self._chosen: ChosenFrames | None = None
@@ -89,17 +80,22 @@ class PlacedOffline(Work):
             InputError: pycolmap is missing, or the frames do not determine their poses.
             KeyboardInterrupt: it was stopped.
         """
-        config, video, chosen = self._config, self.source, self._chosen
+        config = self._config
+        video = self.source
+        chosen = self._chosen
         assert chosen is not None, "no frames have been chosen"
         self._chosen = None  # it takes much memory
         with self._stopwatch("structure from motion"):
             refinement = video.calibration.refinement
             placed = place_frames(
-                chosen, video.camera, not video.is_calibration_open,
+                chosen,
+                video.camera,
+                not video.is_calibration_open,
                 refinement is not None and refinement.failure is None,
-                config.input.readout == "auto" and not video.shutter.readout, config.seed,
+                config.input.readout == "auto" and not video.shutter.readout,
+                config.seed,
                 driver.report,
-            )  # fmt: skip
+            )
         del chosen
         driver.progress.write(
             f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "
@@ -114,9 +110,13 @@ class PlacedOffline(Work):
             T_cw = _place_all(self.source, scene, placed, config, driver.report)
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
         lost = LostFrames(
-            self.source, FrameViews(StraightView.of_pinhole(self.source.camera)), self.trajectory,
-            placed.numbers, scene.keyframe_trajectory(), config.seed,
-        )  # fmt: skip
+            self.source,
+            FrameViews(StraightView.of_pinhole(self.source.camera)),
+            self.trajectory,
+            placed.numbers,
+            scene.keyframe_trajectory(),
+            config.seed,
+        )
         scene.found = lost.search(driver, self._stopwatch)
         for number, pose in zip(scene.found.numbers, scene.found.T_cw, strict=True):
             T_cw[number] = torch.from_numpy(pose)

@@ -29,8 +29,11 @@ Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
 
 SECONDS_PER_FRAME = {
-    "features": 0.1, "choosing pairs": 0.13, "matching": 0.9, "finding poses": 0.25
-}  # fmt: skip
+    "features": 0.1,
+    "choosing pairs": 0.13,
+    "matching": 0.9,
+    "finding poses": 0.25,
+}
 """Seconds of one core, by stage, to locate a frame: some 22 pairs of each are matched (50 frames of
 512 pixels)."""
 

@@ -1,18 +1,22 @@
 """The page that a viewer serves: the scene and the side panel."""
 
 import atexit
+import hmac
 import html
+import secrets
 import time
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from typing import Any
+from unittest import mock
+from urllib.parse import urlsplit
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.application.viewer.guarded_server import GuardedServer
+from geogs.errors import InputError
 from geogs.evaluation.model_view.start_view import FIELD, StartView
 from geogs.evaluation.pages.run_pictures import LAYERS, Layer
 from geogs.geometry.camera import Camera
@@ -20,6 +24,70 @@ from geogs.geometry.lie import matrix_to_quaternion
 from geogs.io.writers.exports.mesh_writers import ONE_SIDED, glb
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
+
+
+class GuardedServer:
+    """A viser server at ``http://host:port/token/``; all other requests are refused.
+
+    viser itself serves every client that reaches the port, and any page that is open in a browser
+    can connect to it, whatever its origin.
+    """
+
+    def __init__(self, host: str, port: int, title: str) -> None:
+        """Begin to serve.
+
+        Raises:
+            InputError: viser is not installed, or is one that cannot be guarded.
+        """
+        try:
+            import viser
+        except ImportError:
+            raise InputError("The viewer needs viser: pip install 'geogs[viewer]'.") from None
+        self._token = secrets.token_urlsafe(16)
+        self._is_guarded = False
+        with redirect_stdout(StringIO()), self._guarded():  # it prints a box with the address
+            self.viser = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        if not self._is_guarded:
+            self.viser.stop()
+            raise InputError(
+                f"The viewer cannot be guarded with viser {viser.__version__}; take another "
+                "version: pip install 'viser==1.1.*'."
+            )
+        self.address = f"http://{host}:{self.viser.get_port()}/{self._token}/"
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Guard servers of the library below viser in the block; viser has no option for it."""
+        from websockets.asyncio import server
+
+        serve = server.serve
+
+        def guarded(*args: Any, process_request: Any = None, **more: Any) -> Any:
+            self._is_guarded = process_request is not None
+
+            def check(connection: Any, request: Any) -> Any:
+                return self._checked(connection, request, process_request)
+
+            return serve(*args, process_request=check, **more)
+
+        with mock.patch.object(server, "serve", guarded):
+            yield
+
+    def _checked(self, connection: Any, request: Any, process_request: Any) -> Any:
+        """Answer a request: by viser if the token and the origin are right, else by refusal."""
+        path, question, query = request.path.partition("?")
+        token, _, rest = path.removeprefix("/").partition("/")
+        origin = request.headers.get("Origin")
+        is_own = origin is None or urlsplit(origin).netloc == request.headers.get("Host")
+        if not is_own or not hmac.compare_digest(token.encode(), self._token.encode()):
+            return connection.respond(403, "The address stands on the terminal of geogs.\n")
+        request.path = f"/{rest}{question}{query}"
+        answer = process_request(connection, request)
+        if answer is not None:
+            answer.headers["X-Frame-Options"] = "DENY"
+            answer.headers["Referrer-Policy"] = "no-referrer"
+        return answer
+
 
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
 AMBIENT = float(np.pi)
@@ -29,10 +97,6 @@ FRUSTA, CAMERA_NOW = 0.01, 0.035
 ROOM, BESIDE = 1.3, 0.1
 """Viewing distance relative to that at which the scene fills the picture, and shift of the view to
 the right as a fraction of it."""
-_FAREWELL = 0.3
-"""Seconds for the server to end."""
-_MIN_MOVE = 1e-3
-"""Least change of an entry of a keyframe's pose for which it is moved."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 """Parts of the scene, by the names of their switches."""
 
@@ -47,7 +111,8 @@ class Window:
             InputError: viser is not installed, or is one that cannot be guarded.
         """
         guarded = GuardedServer(host, port, title)
-        self._server, self.address = guarded.viser, guarded.address
+        self._server = guarded.viser
+        self.address = guarded.address
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         # The light is in the colours already.
         self._server.scene.configure_default_lights(False)
@@ -98,7 +163,7 @@ class Window:
         atexit.unregister(self.stop)
         with redirect_stdout(StringIO()):  # its thread prints that it has ended
             self._server.stop()
-            time.sleep(_FAREWELL)
+            time.sleep(0.3)  # for the server to end
 
     def say(self, heading: str, *sentences: str) -> None:
         """Set the text at the top of the panel; HTML in it is escaped."""
@@ -190,7 +255,7 @@ class Window:
             frustum.visible = self._switches["Keyframes"].value
         else:
             frustum, before = self._frusta[id]
-            if np.abs(before - T_wc).max() <= _MIN_MOVE:
+            if np.abs(before - T_wc).max() <= 1e-3:  # it has hardly moved
                 return
             frustum.wxyz, frustum.position = _place(T_wc)
         self._frusta[id] = frustum, T_wc

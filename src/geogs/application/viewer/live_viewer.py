@@ -25,7 +25,6 @@ MAX_TIME_FRACTION = 0.02
 MAX_DISKS = 30_000
 _MAP_SECONDS = 3.0
 """Least time between two copies of the map."""
-_PICTURE_EDGE = 320
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,8 @@ class LiveViewer(RunObserver):
     """
 
     def __init__(self, window: Window, max_fraction: float = MAX_TIME_FRACTION) -> None:
-        self._window, self._max_fraction = window, max_fraction
+        self._window = window
+        self._max_fraction = max_fraction
         self._follow = window.add_checkbox("Follow", True)
         self._pause = window.add_checkbox("Pause", False)
         self._next: Update | None = None
@@ -99,7 +99,8 @@ class LiveViewer(RunObserver):
             f"frame {status.frames}: {status.state.value}",
             f"{status.keyframes} keyframes, {status.disks} disks, {loops} loops",
         )
-        picture, layer = frame.image, self._window.layer
+        picture = frame.image
+        layer = self._window.layer
         if layer != "image" and (searched := slam.depth_maps()):
             picture = layer_picture(searched[len(searched) - 1], layer)
         disks = None
@@ -108,7 +109,7 @@ class LiveViewer(RunObserver):
             disks = thinned(slam.snapshot())
         return Update(
             words,
-            reduced(picture, _PICTURE_EDGE),
+            reduced(picture, 320),
             slam.camera,
             None if seen is None else np.linalg.inv(seen.numpy()),
             ids,

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 _EVERY = 5
 """Interval of records of the map and the path, in keyframes."""
-_QUALITY = 70
-"""Quality of the JPEG images."""
 
 
 class Recorder(RunObserver):
@@ -52,8 +50,11 @@ class Recorder(RunObserver):
         seen = slam.T_cw
         if seen is None or status.keyframes <= self._keyframes:
             return
-        before, self._keyframes = self._keyframes, status.keyframes
-        rerun, stream, camera = self._rerun, self._stream, slam.camera
+        before = self._keyframes
+        self._keyframes = status.keyframes
+        rerun = self._rerun
+        stream = self._stream
+        camera = slam.camera
         stream.set_time("frame", sequence=frame.index)
         stream.set_time("video", duration=frame.timestamp)
         T_wc = np.linalg.inv(seen.numpy())
@@ -68,7 +69,8 @@ class Recorder(RunObserver):
             image_plane_distance=0.2,
         )
         stream.log("world/camera/image", lens)
-        stream.log("world/camera/image", rerun.Image(frame.image).compress(_QUALITY))
+        # Quality of the JPEG images.
+        stream.log("world/camera/image", rerun.Image(frame.image).compress(70))
         stream.log("keyframes", rerun.Scalars(status.keyframes))
         stream.log("disks", rerun.Scalars(status.disks))
         if status.keyframes // _EVERY > before // _EVERY:
@@ -76,7 +78,8 @@ class Recorder(RunObserver):
 
     def result(self, result: "Result") -> None:
         """Record the final path and mesh, and close the file."""
-        rerun, stream = self._rerun, self._stream
+        rerun = self._rerun
+        stream = self._stream
         path = result.trajectory.T_wc[result.trajectory.tracked, :3, 3]
         stream.log("world/path", rerun.LineStrips3D([path], colors=[(242, 163, 58)]))
         stream.log("world/disks", rerun.Clear(recursive=False))

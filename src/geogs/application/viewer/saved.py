@@ -11,10 +11,6 @@ from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.pages.run_pictures import layer_picture
 
-MAX_FRUSTA = 24
-"""Largest number of keyframes shown, evenly along the path."""
-_IMAGE_EDGE = 160
-
 
 def open_window(result: SavedResult, host: str, port: int) -> Window:
     """Show a result; the window serves until it is stopped.
@@ -23,7 +19,8 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
         InputError: viser is not installed, or the result is damaged.
     """
     window = Window(f"geogs: {result.name}", host, port)
-    mesh, trajectory = result.mesh, result.trajectory
+    mesh = result.mesh
+    trajectory = result.trajectory
     points = result.disks.position.cpu().numpy() if mesh is None else mesh.vertices
     surface = None if mesh is None else facets(mesh.vertices, mesh.faces, mesh.normals)
     levelled, start = stand(trajectory, points, surface)
@@ -42,11 +39,13 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
 def _show_keyframes(result: SavedResult, window: Window) -> None:
     views = result.views
     count = len(views.keyframe_id)
-    shown = np.unique(np.linspace(0, count - 1, min(count, MAX_FRUSTA)).round().astype(int))
+    # Largest number of keyframes shown, evenly along the path.
+    shown = np.unique(np.linspace(0, count - 1, min(count, 24)).round().astype(int))
     for number in shown.tolist():
         image = result.image(number)
-        image = None if image is None else reduced(image, _IMAGE_EDGE)
-        id, T_wc = int(views.keyframe_id[number]), np.linalg.inv(views.T_cw[number])
+        image = None if image is None else reduced(image, 160)
+        id = int(views.keyframe_id[number])
+        T_wc = np.linalg.inv(views.T_cw[number])
         window.show_keyframe(id, T_wc, result.camera, image)
 
 
@@ -54,7 +53,8 @@ class _Inspector:
     """Shows the selected keyframe in the selected layer."""
 
     def __init__(self, result: SavedResult, window: Window) -> None:
-        self._result, self._window = result, window
+        self._result = result
+        self._window = window
         self._number = 0
         self._lock = threading.Lock()
 
@@ -75,7 +75,8 @@ class _Inspector:
     def _show(self) -> None:
         # Depth is rendered from the disks on demand: one at a time.
         with self._lock:
-            result, number = self._result, self._number
+            result = self._result
+            number = self._number
             views = result.views
             T_wc = np.linalg.inv(views.T_cw[number])
             try:
@@ -90,7 +91,8 @@ class _Inspector:
             self._window.say(result.name, *self._words(number))
 
     def _picture(self, number: int) -> np.ndarray:
-        result, layer = self._result, self._window.layer
+        result = self._result
+        layer = self._window.layer
         image = result.image(number) if layer == "image" else None
         if image is not None:
             return image

@@ -110,7 +110,8 @@ class _State:
     @staticmethod
     def at_start(problem: BundleProblem) -> "_State":
         """Return the initial state of the adjustment."""
-        d, T = problem.inverse_depth, problem.T_cw
+        d = problem.inverse_depth
+        T = problem.T_cw
         memory = torch.zeros(T.numel() + 1, dtype=torch.float64, device=d.device)
         memory[:-1].copy_(to_device(T.reshape(-1), d.device))
         return _State(memory, d)
@@ -184,22 +185,28 @@ class _DenseSteps:
     def __init__(
         self, bundle: CudaDenseBundle, problem: BundleProblem, options: BundleOptions
     ) -> None:
-        self.grid, self.problem, self.options = bundle.grid, problem, options
-        self.kernels, self.solvers = bundle.kernels, bundle.solvers
+        self.grid = bundle.grid
+        self.problem = problem
+        self.options = options
+        self.kernels = bundle.kernels
+        self.solvers = bundle.solvers
         self.matches = problem.pixels.contiguous(), problem.weight.contiguous()
         d = problem.inverse_depth
         self.structure = s = bundle.structure_of(problem)
         self.edges = LinearisedEdges(self.kernels, s.edges, d)
         self.depth_terms = KernelDepthTerms.of(problem.depth_terms)
-        size, pairs = 6 * s.poses, len(s.edges.pair_a)
+        size = 6 * s.poses
+        pairs = len(s.edges.pair_a)
         like = d.new_empty(0, dtype=torch.float64)
         self.system = like.new_empty((size + 1) * size)
         """The camera system; the right-hand side is its last row."""
         self.inverses = like.new_empty(-(-size // PANEL) * PANEL * PANEL)
         self.good = like.new_empty(1, dtype=torch.int32)
-        self.xi, self.delta = like.new_zeros(6 * s.frames), d.new_empty(d.numel())
+        self.xi = like.new_zeros(6 * s.frames)
+        self.delta = d.new_empty(d.numel())
         """Steps of the poses, and of the inverse depths."""
-        self.blocks, self.vectors = like.new_empty(144 * pairs), like.new_empty(12 * pairs)
+        self.blocks = like.new_empty(144 * pairs)
+        self.vectors = like.new_empty(12 * pairs)
 
     def linearise(self, state: _State) -> bool:
         """Linearise edges, summed by source; return True."""
@@ -222,9 +229,14 @@ class _DenseSteps:
         """Return the cost (twice the objective); waits for the GPU."""
         p = self.problem
         matched = edge_costs(
-            self.kernels, self.structure.edges, self.grid, state.T, state.inverse_depth,
-            self.matches, self.options.huber,
-        )  # fmt: skip
+            self.kernels,
+            self.structure.edges,
+            self.grid,
+            state.T,
+            state.inverse_depth,
+            self.matches,
+            self.options.huber,
+        )
         terms = sum(term.cost(state.everything) for term in p.depth_terms)
         if p.pose_terms:
             here = state.with_poses_here
@@ -237,9 +249,17 @@ class _DenseSteps:
             return
         self.edges.eliminate(self.blocks, self.vectors)
         self.kernels["assemble_system"](
-            len(s.places), 256, s.places, s.first_part, s.parts, self.blocks, self.vectors, s.poses,
-            damping, self.system,
-        )  # fmt: skip
+            len(s.places),
+            256,
+            s.places,
+            s.first_part,
+            s.parts,
+            self.blocks,
+            self.vectors,
+            s.poses,
+            damping,
+            self.system,
+        )
         self._add_pose_terms(state, damping)
         if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
@@ -254,7 +274,8 @@ class _DenseSteps:
         problem = self.problem
         if not problem.pose_terms:
             return
-        poses, here = DenseCameraSystem(problem.free_pose.cpu()), state.with_poses_here
+        poses = DenseCameraSystem(problem.free_pose.cpu())
+        here = state.with_poses_here
         for term in problem.pose_terms:
             poses.add(term.hyper_edges(here))
         hessian = poses.hessian[poses.free[:, None], poses.free]
@@ -266,7 +287,8 @@ class _DenseSteps:
 
     def _solve_many_poses(self) -> None:
         """Solve by Cholesky's method, panel by panel."""
-        s, size = self.structure, 6 * self.structure.poses
+        s = self.structure
+        size = 6 * self.structure.poses
         for k in range(0, size, PANEL):
             self.solvers["factor_panel"](1, 256, self.system, size, k, self.inverses, self.good)
             # The right-hand side is a row below every panel.
@@ -280,11 +302,21 @@ class _DenseSteps:
         )
 
     def _moved(self, state: _State) -> _State:
-        s, edges, moved = self.structure, self.edges, state.copy()
+        s = self.structure
+        edges = self.edges
+        moved = state.copy()
         edges.find_depth_steps(self.xi, self.delta, moved.failed)
         self.kernels["take_steps"](
-            (-(-edges.cells // edges.block), s.frames), edges.block, s.slot, s.edges.free_depth,
-            self.xi, self.delta, edges.cells, *INVERSE_DEPTHS, moved.failed, moved.T,
+            (-(-edges.cells // edges.block), s.frames),
+            edges.block,
+            s.slot,
+            s.edges.free_depth,
+            self.xi,
+            self.delta,
+            edges.cells,
+            *INVERSE_DEPTHS,
+            moved.failed,
+            moved.T,
             moved.inverse_depth,
-        )  # fmt: skip
+        )
         return moved

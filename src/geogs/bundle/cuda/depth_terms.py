@@ -6,8 +6,7 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
-from geogs.bundle.terms import DepthTerm
+from geogs.bundle.terms import DepthDamping, DepthTerm, MeasuredDepths
 
 
 class KernelDepthTerms(NamedTuple):
@@ -28,7 +27,8 @@ class KernelDepthTerms(NamedTuple):
             if isinstance(term, DepthDamping) and found.damping is None:
                 found = found._replace(damping=term.curvature.contiguous())
             elif isinstance(term, MeasuredDepths) and found.measured is None:
-                measured, information = term.inverse_depth, term.information
+                measured = term.inverse_depth
+                information = term.information
                 found = found._replace(
                     measured=measured.contiguous(), information=information.contiguous()
                 )

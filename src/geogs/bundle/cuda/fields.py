@@ -21,7 +21,9 @@ MOST_THREADS = 1024
 
 def _pyramid_size(grid: SampleGrid) -> int:
     """Return the number of floats of the coarser levels of one field and its confidence."""
-    width, height, total = grid.width, grid.height, 0
+    width = grid.width
+    height = grid.height
+    total = 0
     while min(width, height) > 2:
         width, height = -(-width // 2), -(-height // 2)
         total += 2 * width * height
@@ -35,13 +37,22 @@ class CudaFields(GridFields):
         self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
     ) -> Float[Tensor, "*n p"]:
         """Fill all fields in one launch."""
-        values, confidence = values.contiguous(), confidence.contiguous()
-        out, size = torch.empty_like(values), _pyramid_size(self.grid)
+        values = values.contiguous()
+        confidence = confidence.contiguous()
+        out = torch.empty_like(values)
+        size = _pyramid_size(self.grid)
         count = out.numel() // self.grid.size
         kernels_for(SOURCE, values.device)["fill_fields"](
-            count, block_size(self.grid.size, MOST_THREADS), values, confidence, self.grid.width,
-            self.grid.height, size, values.new_empty(count * size), out,
-        )  # fmt: skip
+            count,
+            block_size(self.grid.size, MOST_THREADS),
+            values,
+            confidence,
+            self.grid.width,
+            self.grid.height,
+            size,
+            values.new_empty(count * size),
+            out,
+        )
         return out
 
     def transfer(
@@ -52,9 +63,13 @@ class CudaFields(GridFields):
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         first = torch.zeros(1, dtype=torch.long)
         depth, propagated = self._propagate(
-            T_ji[None], torch.eye(4).to(T_ji)[None], first, inverse_depth[None], information[None],
+            T_ji[None],
+            torch.eye(4).to(T_ji)[None],
+            first,
+            inverse_depth[None],
+            information[None],
             reproject=False,
-        )  # fmt: skip
+        )
         return depth[0], propagated[0]
 
     def reproject(
@@ -86,13 +101,16 @@ class CudaFields(GridFields):
         the pixels (n, p, 2) of the sources' cells in the views and of the views' cells in the
         sources.
         """
-        grid, camera, n = self.grid, self.grid.camera, len(T)
+        grid = self.grid
+        camera = self.grid.camera
+        n = len(T)
         device = inverse_depth.device
         poses = to_device(torch.cat([T, T_source]), device)
         rows = to_device(source, device, torch.int32)
         size = 2 * grid.size + _pyramid_size(grid)
         memory = inverse_depth.new_empty(n * (size + grid.size))
-        scratch, depth = memory[: n * size], memory[n * size :]
+        scratch = memory[: n * size]
+        depth = memory[n * size :]
         shape = (2, n, grid.size, 2) if reproject else (n, grid.size)
         out = inverse_depth.new_empty(shape)
         there, back = out.unbind() if reproject else (None, None)

@@ -33,18 +33,28 @@ class CudaPairs(KeyframePairs):
         return len(self.source)
 
     def project(self) -> Float[Tensor, "e p 2"]:
-        grid, c = self.grid, self.grid.camera
+        grid = self.grid
+        c = self.grid.camera
         pixels = self.inverse_depth.new_empty(len(self), grid.size, 2)
         self._kernel("project_pairs")(
-            len(self), block_size(grid.size), self.T_cw, self.inverse_depth, self.source,
-            self.target, grid.rays, grid.size, *c.numbers, pixels,
-        )  # fmt: skip
+            len(self),
+            block_size(grid.size),
+            self.T_cw,
+            self.inverse_depth,
+            self.source,
+            self.target,
+            grid.rays,
+            grid.size,
+            *c.numbers,
+            pixels,
+        )
         return pixels
 
     def moved(
         self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e"]:
-        grid, c = self.grid, self.grid.camera
+        grid = self.grid
+        c = self.grid.camera
         median = self.inverse_depth.new_empty(len(self))
         self._kernel("moved_pairs")(
             len(self), block_size(grid.size), self.T_cw, self.inverse_depth, self.source,
@@ -54,7 +64,8 @@ class CudaPairs(KeyframePairs):
         return median
 
     def distances(self, rotation_weight: float) -> Float[Tensor, "e"]:
-        grid, c = self.grid, self.grid.camera
+        grid = self.grid
+        c = self.grid.camera
         distance = self.inverse_depth.new_empty(len(self))
         self._kernel("pair_distances")(
             len(self), min(block_size(grid.size), 128), self.T_cw, self.inverse_depth, self.source,

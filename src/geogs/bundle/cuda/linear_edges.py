@@ -12,12 +12,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.depth_terms import MEASURED_HUBER
 from geogs.bundle.flow_term import BEHIND
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import MEASURED_HUBER
 from geogs.gpu.kernels import Kernel
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import SampleGrid
+
+LAUNCH_BOUND = 512
+"""Most threads of a block of the kernels that adjust poses, or depths at given poses."""
 
 
 def block_size(cells: int, most: int = 256) -> int:
@@ -76,7 +79,9 @@ def edge_costs(
     huber: float,
 ) -> Float[Tensor, "e"]:
     """Compute Huber's cost of the matched cells of each edge, float64: ``FlowTerm.cost``."""
-    a, c, cells = arrays, grid.camera, depth.shape[1]
+    a = arrays
+    c = grid.camera
+    cells = depth.shape[1]
     cost = depth.new_empty(len(a.source), dtype=torch.float64)
     kernels["find_edge_costs"](
         len(a.source), block_size(cells), poses, depth, a.source, a.target, *matches, grid.rays,
@@ -92,8 +97,11 @@ class LinearisedEdges:
         self, kernels: Mapping[str, Kernel], arrays: EdgeArrays, depth: Float[Tensor, "s p"]
     ) -> None:
         """``depth`` has the shape of the sources' inverse depths."""
-        edges, cells = len(arrays.source), depth.shape[1]
-        self.kernels, self.arrays, self.block = kernels, arrays, block_size(cells)
+        edges = len(arrays.source)
+        cells = depth.shape[1]
+        self.kernels = kernels
+        self.arrays = arrays
+        self.block = block_size(cells)
         self.motion = depth.new_empty(12 * edges, dtype=torch.float64)
         self.normal = depth.new_empty(32 * edges, dtype=torch.float64)
         self.coupling = depth.new_empty(6 * edges * cells)
@@ -118,7 +126,9 @@ class LinearisedEdges:
         terms: KernelDepthTerms,
     ) -> None:
         """Linearise all edges; sum the equations of each source's depths, with all terms."""
-        a, c, (curvature, gradient) = self.arrays, grid.camera, self.per_edge
+        a = self.arrays
+        c = grid.camera
+        (curvature, gradient) = self.per_edge
         self.kernels["linearise_edges"](
             len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
             self.cells, *c.numbers, options.huber, self.motion, self.normal,

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.cuda.linear_edges import block_size, edges_by_frame
+from geogs.bundle.cuda.linear_edges import LAUNCH_BOUND, block_size, edges_by_frame
 from geogs.bundle.motion_only import MotionSolver
 from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
@@ -14,9 +14,6 @@ from geogs.gpu.transfer import to_device
 from geogs.world.keyframes import KNOWN, Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
-
-MOST_THREADS = 512
-"""Most threads of a block: the launch bound of these kernels."""
 
 
 class CudaMotion(MotionSolver):
@@ -28,15 +25,19 @@ class CudaMotion(MotionSolver):
     def solve(
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-        T_cw, d, frame = problem.T_cw, problem.inverse_depth, problem.frame.cpu()
+        T_cw = problem.T_cw
+        d = problem.inverse_depth
+        frame = problem.frame.cpu()
         c = self.grid.camera
-        n, device = len(T_cw), d.device
+        n = len(T_cw)
+        device = d.device
         first, order = edges_by_frame(frame, n, device)
         poses = to_device(torch.cat([T_cw, problem.T_source]), device)
-        pixels, weight = problem.pixels.contiguous(), problem.weight.contiguous()
+        pixels = problem.pixels.contiguous()
+        weight = problem.weight.contiguous()
         residual = torch.empty_like(pixels)
         kernels_for(SOURCE, device)["solve_poses"](
-            n, block_size(d.shape[1], MOST_THREADS), first, order, d.contiguous(), poses[n:],
+            n, block_size(d.shape[1], LAUNCH_BOUND), first, order, d.contiguous(), poses[n:],
             pixels, weight, None, self.rays, d.shape[1], *c.numbers, iterations, huber,
             poses, residual,
         )  # fmt: skip
@@ -52,15 +53,19 @@ class CudaMotion(MotionSolver):
         huber: float,
         limit: float,
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
-        grid, c, known = self.grid, self.grid.camera, keyframe.information
-        device, threads = known.device, block_size(grid.size, MOST_THREADS)
+        grid = self.grid
+        c = self.grid.camera
+        known = keyframe.information
+        device = known.device
+        threads = block_size(grid.size, LAUNCH_BOUND)
         # Both poses in one piece, followed by the results.
         found = torch.cat([torch.eye(4).reshape(-1), torch.zeros(7)]).to(T_guess)
         state = torch.cat([T_guess.reshape(-1), keyframe.T_cw.reshape(-1), found])
         state = to_device(state, device)
         T, T_source, T_ji, judged = state.split([16, 16, 16, 7])
         rows = torch.arange(2, dtype=torch.int32, device=device)
-        pixels, weight = pixels.contiguous(), weight.contiguous()
+        pixels = pixels.contiguous()
+        weight = weight.contiguous()
         residual = torch.empty_like(pixels)
         kernels = kernels_for(SOURCE, device)
         kernels["solve_poses"](

@@ -6,14 +6,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.cuda.linear_edges import block_size, edges_by_frame
+from geogs.bundle.cuda.linear_edges import LAUNCH_BOUND, block_size, edges_by_frame
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 
 SOURCE = Path(__file__).with_name("rigidity.cu")
-MOST_THREADS = 512
-"""Most threads of a block: the launch bound of the kernel."""
 
 
 def best_residuals(
@@ -33,14 +31,15 @@ def best_residuals(
 
     These and ``source`` are on the CPU, all else on the GPU, where nothing waits.
     """
-    device, (frames, cells) = inverse_depth.device, inverse_depth.shape
+    device = inverse_depth.device
+    (frames, cells) = inverse_depth.shape
     first, order = edges_by_frame(source, frames, device)
     motions = to_device(T_ji[:, :3].reshape(-1), device, torch.float32)
     depth = inverse_depth.clone(memory_format=torch.contiguous_format)
     scratch = depth.new_empty(2 * depth.numel())
     residual = depth.new_empty(len(source), cells)
     kernels_for(SOURCE, device)["best_residuals"](
-        frames, block_size(cells, MOST_THREADS), first, order, motions, rays, pixels.contiguous(),
+        frames, block_size(cells, LAUNCH_BOUND), first, order, motions, rays, pixels.contiguous(),
         weight.contiguous(), cells, camera.fx, camera.fy, camera.cx, camera.cy, huber, iterations,
         *between, behind, depth, scratch, residual,
     )  # fmt: skip

@@ -75,7 +75,8 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         self, problem: StreamedProblem, bundle: CudaStreamedBundle, options: BundleOptions
     ) -> None:
         super().__init__(problem, options)
-        self.grid, self.kernels = bundle.grid, bundle.kernels
+        self.grid = bundle.grid
+        self.kernels = bundle.kernels
         self.depth_terms = KernelDepthTerms.of(problem.depth_terms)
         self.system = SparseCameraSystem(*problem.joined(), problem.free_pose)
         device = problem.inverse_depth.device
@@ -84,13 +85,17 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
 
     def linearise(self, state: BundleState) -> SparseCameraSystem:
         """Linearise chunk by chunk."""
-        T, d, system = state.T_cw, state.inverse_depth, self.system
+        T = state.T_cw
+        d = state.inverse_depth
+        system = self.system
         system.clear()
         blocks = d.new_zeros(system.size, 36, dtype=torch.float64)
         pull = d.new_zeros(len(T), 6, dtype=torch.float64)
         for chunk in self.chunks:
-            edges, pairs = self._linearise(state, chunk), len(chunk.arrays.pair_a)
-            found, vectors = blocks.new_empty(4 * pairs, 6, 6), blocks.new_empty(2 * pairs, 6)
+            edges = self._linearise(state, chunk)
+            pairs = len(chunk.arrays.pair_a)
+            found = blocks.new_empty(4 * pairs, 6, 6)
+            vectors = blocks.new_empty(2 * pairs, 6)
             edges.eliminate(found, vectors)
             blocks.index_add_(0, chunk.added_to, found[chunk.added].flatten(1))
             blocks.index_add_(0, chunk.mirrored_to, found[chunk.mirrored].mT.flatten(1))
@@ -103,13 +108,19 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
 
     def flow_cost(self, state: BundleState) -> float:
         """Compute the cost chunk by chunk."""
-        d, cost = state.inverse_depth, state.inverse_depth.new_zeros(1, dtype=torch.float64)
+        d = state.inverse_depth
+        cost = state.inverse_depth.new_zeros(1, dtype=torch.float64)
         for chunk in self.chunks:
             depth = d[chunk.sources.to(d.device)]
             cost += edge_costs(
-                self.kernels, chunk.arrays, self.grid, self._poses(state, chunk), depth,
-                self._matches(chunk), self.options.huber,
-            ).sum()  # fmt: skip
+                self.kernels,
+                chunk.arrays,
+                self.grid,
+                self._poses(state, chunk),
+                depth,
+                self._matches(chunk),
+                self.options.huber,
+            ).sum()
         return float(cost)
 
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
@@ -120,7 +131,8 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
         """Compute the depth steps from edges linearised a second time."""
-        d, xi = state.inverse_depth, step.reshape(-1, 6)
+        d = state.inverse_depth
+        xi = step.reshape(-1, 6)
         delta = torch.zeros_like(d)
         failed = torch.zeros(1, dtype=torch.int32, device=d.device)
         for chunk in self.chunks:
@@ -135,9 +147,13 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         depth = state.inverse_depth[own]
         edges = LinearisedEdges(self.kernels, chunk.arrays, depth)
         edges.fill(
-            self.grid, self._poses(state, chunk), depth, self._matches(chunk), self.options,
+            self.grid,
+            self._poses(state, chunk),
+            depth,
+            self._matches(chunk),
+            self.options,
             self.depth_terms.of_rows(own),
-        )  # fmt: skip
+        )
         return edges
 
     def _poses(self, state: BundleState, chunk: _Chunk) -> Float[Tensor, "m"]:
@@ -153,7 +169,8 @@ def _chunk(
     problem: StreamedProblem, edges: slice, system: SparseCameraSystem, device: torch.device
 ) -> _Chunk:
     """Build a chunk's index arrays, copied to the device at once."""
-    source, target = problem.source[edges].numpy(), problem.target[edges].numpy()
+    source = problem.source[edges].numpy()
+    target = problem.target[edges].numpy()
     own = np.unique(source)
     frames = np.concatenate([own, np.setdiff1d(target, own)])
     number = np.empty(len(problem.T_cw), np.int64)
@@ -163,9 +180,11 @@ def _chunk(
     a, b = joined_edges(first, free)
     row = np.stack([target[a], target[a], source[a], source[a]], 1).reshape(-1)
     column = np.stack([target[b], source[a], target[b], source[a]], 1).reshape(-1)
-    place, mirror = system.block_indices(row, column), system.block_indices(column, row)
+    place = system.block_indices(row, column)
+    mirror = system.block_indices(column, row)
     mirror[np.repeat(a == b, 4)] = -1  # the elimination gives both sides
-    added, mirrored = np.flatnonzero(place >= 0), np.flatnonzero(mirror >= 0)
+    added = np.flatnonzero(place >= 0)
+    mirrored = np.flatnonzero(mirror >= 0)
     same = np.flatnonzero(a == b)
     pulled = np.concatenate([2 * same, 2 * same + 1])
     pulled_to = np.concatenate([target[a[same]], source[a[same]]])

@@ -9,20 +9,18 @@ Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bier
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import linearised_sources
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import CellProjection, carried_over, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.terms import BundleState
 from geogs.bundle.uncertainty.marginals import Considered, pose_covariance
 from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
@@ -35,9 +33,9 @@ SHAPES = RADIAL + 2
 """All shapes: also one along either side of the image for the principal point, in focal lengths."""
 Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
 """Returns the shifts of a problem's matches per relative change of the readout: one more shape."""
-LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001, 0.001, 0.002), 0.005
-"""Least deviation of each size, however many matches agree: half of the sizes estimated for lenses
-without error (docs/notebook/lens.md)."""
+LEAST = 0.0005, 0.0005, 0.001, 0.001, 0.002, 0.005
+"""Least deviation of each size, and of the readout's, however many matches agree: half of the sizes
+estimated for lenses without error (docs/notebook/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Prior deviations of the radial sizes."""
 CENTRE, GIVEN_CENTRE = 0.03, 0.002
@@ -61,32 +59,15 @@ def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
 
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "5 *b 2"]:
     """Return the pixel offset for each shape with size one, to first order."""
-    focal, plane = pixels.new_tensor([camera.fx, camera.fy]), camera.plane(pixels)
-    off, flat = pixels - pixels.new_tensor([camera.cx, camera.cy]), focal * plane
+    focal = pixels.new_tensor([camera.fx, camera.fy])
+    plane = camera.plane(pixels)
+    off = pixels - pixels.new_tensor([camera.cx, camera.cy])
+    flat = focal * plane
     square = plane.square().sum(-1, keepdim=True)
     right, down = torch.zeros_like(off), torch.zeros_like(off)
-    right[..., 0], down[..., 1] = camera.fx, camera.fy
+    right[..., 0] = camera.fx
+    down[..., 1] = camera.fy
     return torch.stack([-off, -flat * square, -flat * square.square(), -right, -down])
-
-
-def shape_shifts(
-    camera: Camera,
-    rays: Float[Tensor, "p 3"],
-    T_ji: Float[Tensor, "e 4 4"],
-    at: CellProjection,
-    sizes: Float[Tensor, "m 5"],
-) -> Float[Tensor, "m e p 2"]:
-    """Return shifts of matches for each of some errors with these sizes.
-
-    The content of a cell is offset from it, and so is its match in the target; the former offset is
-    propagated at the cell's depth. The latter is evaluated at the cell's projection (``at``): the
-    match itself is off by the residual, and the product of both would count as evidence.
-    """
-    there, here = (
-        torch.einsum("mk,k...->m...", sizes, lens_shapes(camera, p))
-        for p in (at.pixels, _own_pixels(camera, rays))
-    )
-    return there - carried_over(camera, rays, T_ji, at, here[:, None].expand_as(there))
 
 
 def shifts_of_edges(
@@ -96,21 +77,19 @@ def shifts_of_edges(
     at: CellProjection,
     sizes: Float[Tensor, "e 2 5"],
 ) -> Float[Tensor, "e p 2"]:
-    """Return shifts of matches for one error of each edge's source and one of its target."""
+    """Return shifts of matches for one error of each edge's source and one of its target.
+
+    The content of a cell is offset from it, and so is its match in the target; the former offset is
+    propagated at the cell's depth. The latter is evaluated at the cell's projection (``at``): the
+    match itself is off by the residual, and the product of both would count as evidence.
+    """
     there = torch.einsum("ek,kepc->epc", sizes[:, 1], lens_shapes(camera, at.pixels))
-    own = lens_shapes(camera, _own_pixels(camera, rays))
+    own = lens_shapes(camera, camera.pixels(rays[:, :2]))
     here = torch.einsum("ek,kpc->epc", sizes[:, 0], own)
     return there - carried_over(camera, rays, T_ji, at, here)
 
 
-def _own_pixels(camera: Camera, rays: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
-    """Return the pixels of cells with these rays."""
-    own = rays.new_tensor([camera.fx, camera.fy]) * camera.bent(rays[:, :2])
-    return own + rays.new_tensor([camera.cx, camera.cy])
-
-
-@dataclass(frozen=True)
-class LensEvidence:
+class LensEvidence(NamedTuple):
     """Normal equations of the sizes of a lens' error, poses and depths eliminated."""
 
     information: Float[Tensor, "s k k"]
@@ -125,12 +104,7 @@ class LensEvidence:
 
     def joined(self, other: "LensEvidence") -> "LensEvidence":
         """Concatenate the evidence of both, poses of one after those of the other."""
-        return LensEvidence(
-            torch.cat([self.information, other.information]),
-            torch.cat([self.gradient, other.gradient]),
-            torch.cat([self.moves, other.moves]),
-            torch.cat([self.depth_moves, other.depth_moves]),
-        )
+        return LensEvidence(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
 
     @property
     def bend(self) -> "LensEstimate":
@@ -184,8 +158,9 @@ class LensEvidence:
         """Estimate some sizes, the others being zero."""
         sizes = list(asked)
         information = self.information[:, sizes][:, :, sizes]
-        least = tuple((*LEAST, LEAST_OF_READOUT)[n] for n in sizes)
-        return _estimate(information, self.gradient[:, sizes]).floored(least)
+        found = _estimate(information, self.gradient[:, sizes])
+        least = found.size.new_tensor([LEAST[n] for n in sizes])
+        return found._replace(covariance=found.covariance + torch.diag(least.square()))
 
     def considered(
         self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
@@ -228,7 +203,8 @@ class LensEstimate(NamedTuple):
 
     def without(self, size: int) -> "LensEstimate":
         """Return the estimate of the other sizes, given that one is zero."""
-        known, left = self.told(size, 0.0, 0.0), torch.arange(len(self.size)) != size
+        known = self.told(size, 0.0, 0.0)
+        left = torch.arange(len(self.size)) != size
         return LensEstimate(known.size[left], known.covariance[left][:, left])
 
     def told(self, size: int, value: float, deviation: float) -> "LensEstimate":
@@ -242,11 +218,6 @@ class LensEstimate(NamedTuple):
         """Scale all sizes down so that one of them is at most ``most``."""
         part = (most / self.size[size].abs()).clamp(max=1)
         return LensEstimate(part * self.size, self.covariance)
-
-    def floored(self, least: tuple[float, ...]) -> "LensEstimate":
-        """Return it with least deviations of the sizes added."""
-        floor = torch.diag(self.size.new_tensor(least).square())
-        return LensEstimate(self.size, self.covariance + floor)
 
     def of(self, sizes: slice) -> "LensEstimate":
         """Return the marginal estimate of some of the sizes."""
@@ -295,71 +266,48 @@ def lens_evidence(
     """
     thinned = ThinnedProblem(grid, problem, cells)
     scale = 1 / thinned.fraction
-    size, shapes = 6 * len(problem.T_cw), SHAPES + (rows is not None)
-    poses, pull = (torch.zeros(size, width, dtype=torch.float64) for width in (size, shapes))
-    each = list(_reduced(thinned, options, rows))
-    for s in each:
-        poses[s.rows[:, None], s.rows] += scale * s.poses
-        pull[s.rows] += scale * s.pull
+    n = len(problem.T_cw)
+    shapes = SHAPES + (rows is not None)
+    poses = torch.zeros(6 * n, 6 * n, dtype=torch.float64)
+    both = poses.new_zeros(6 * n, shapes)
+    equations = []
+    on_depths = []
+    for source in thinned.sources(options, LensFlow(further=partial(_further, thinned, rows))):
+        hessian, gradient = source.edges.chained()
+        slots = source.edges.rows(n)[:-shapes]
+        c = len(slots)
+        poses[slots[:, None], slots] += scale * hessian[:c, :c]
+        both[slots] += scale * hessian[:c, c:]
+        equations.append((slots, hessian[:, c:], gradient))
+        on_depths.append(-source.edges.depth.coupling[-shapes:].mT)
     covariance = pose_covariance(problem, poses)
     if not bool(covariance.isfinite().all()):
         return None
-    moves = covariance @ pull
-    information = [s.information - s.pull.mT @ moves[s.rows] for s in each]
-    gradient = [s.gradient + moves[s.rows].mT @ s.descent for s in each]
-    depth = torch.zeros(len(problem.T_cw), thinned.count * of_depths, shapes)
+    moves = -covariance @ both
+    information = [H[-shapes:] + H[:-shapes].mT @ moves[slots] for slots, H, _ in equations]
+    gradients = [g[-shapes:] + moves[slots].mT @ g[:-shapes] for slots, _, g in equations]
+    depth = torch.zeros(n, thinned.count * of_depths, shapes)
     if of_depths:
-        for s, source in zip(each, thinned.sources(options), strict=True):
-            depth[source.frame] = thinned.depth_moves(source, s.on_depth.mT, moves)
+        for source, on_depth in zip(thinned.sources(options), on_depths, strict=True):
+            depth[source.frame] = thinned.depth_moves(source, on_depth, moves)
     return LensEvidence(
-        scale * torch.stack(information), scale * torch.stack(gradient), moves, depth
+        scale * torch.stack(information), scale * torch.stack(gradients), moves, depth
     )
 
 
-class _Reduced(NamedTuple):
-    """Equations of a source's poses and of the sizes, with its depths eliminated."""
-
-    rows: Int[Tensor, "c"]
-    poses: Float[Tensor, "c c"]
-    pull: Float[Tensor, "c k"]
-    """Gradient on the poses by an error of size one."""
-    descent: Float[Tensor, "c"]
-    """Gradient on the poses by the residuals."""
-    on_depth: Float[Tensor, "k p"]
-    """Gradient on the depths by an error of size one."""
-    information: Float[Tensor, "k k"]
-    gradient: Float[Tensor, "k"]
-    """Direction of descent of the sizes at fixed poses."""
-
-
-def _reduced(
-    thinned: ThinnedProblem, options: BundleOptions, rows: Rows | None
-) -> Iterator[_Reduced]:
-    """Yield each source in order. A shift added to a match is subtracted from the cell's projection
-    by the lens, hence the signs of the terms that couple sizes with poses or depths."""
-
-    def fallen(part: BundleProblem) -> Float[Tensor, "e o p 2"]:
-        T_ji = relative_motion(part.T_cw, part.source, part.target)
-        at = project(thinned.camera, thinned.rays, T_ji, part.inverse_depth[part.source])
-        centre = torch.eye(SHAPES).to(at.pixels)[RADIAL:]
-        moved = [*shape_shifts(thinned.camera, thinned.rays, T_ji, at, centre)]
-        if rows is not None:
-            moved.append(rows(part, thinned.rays, at))
-        return -torch.stack(moved, 1)
-
-    flow = LensFlow(further=fallen)
-    for part in thinned.parts(options):
-        state = BundleState(part.T_cw, part.inverse_depth, thinned.lens)
-        for source in linearised_sources(flow, part, state, options):
-            edges = source.edges
-            hessian, gradient = edges.chained()
-            c = len(gradient) - edges.shared
-            yield _Reduced(
-                edges.rows(len(part.T_cw))[:c],
-                hessian[:c, :c],
-                -hessian[:c, c:],
-                gradient[:c],
-                -source.depth.coupling[-edges.shared :],
-                hessian[c:, c:],
-                gradient[c:],
-            )
+def _further(
+    thinned: ThinnedProblem, rows: Rows | None, part: BundleProblem
+) -> Float[Tensor, "e o p 2"]:
+    """Return derivatives of the cells' projections by the sizes that are no parameters of a
+    :class:`~geogs.bundle.lens.LensBlock`: the principal point, and the readout."""
+    camera = thinned.camera
+    T_ji = relative_motion(part.T_cw, part.source, part.target)
+    at = project(camera, thinned.rays, T_ji, part.inverse_depth[part.source])
+    there = lens_shapes(camera, at.pixels)[RADIAL:]
+    here = lens_shapes(camera, camera.pixels(thinned.rays[:, :2]))[RADIAL:]
+    here = carried_over(camera, thinned.rays, T_ji, at, here[:, None].expand_as(there))
+    moved = [*(there - here)]
+    if rows is not None:
+        moved.append(rows(part, thinned.rays, at))
+    # A shift added to a match is subtracted from the cell's projection.
+    return -torch.stack(moved, 1)

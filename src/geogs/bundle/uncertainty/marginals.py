@@ -2,7 +2,8 @@
 
 With the reduced camera system S of all terms (depths eliminated) and the coupling e of an inverse
 depth with the poses, ``var d = 1/c + e^T S^-1 e / c^2``: due to its own matches, and due to the
-poses. Source: the block inverse; Rosinol et al. 2023 use it for dense bundle adjustment.
+poses. Source: the block inverse; Rosinol et al. 2023 use it for dense bundle adjustment. Deviations
+of poses after alignment with the truth do not depend on the choice of world frame and unit.
 """
 
 from collections.abc import Iterator
@@ -13,13 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import SourceFlow, linearised_sources, weighed_residuals
+from geogs.bundle.flow_term import SourceFlow, linearised_sources, residual_norms, weighed_residuals
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import sources_within
-from geogs.bundle.projection import linearise, relative_motion
+from geogs.bundle.projection import linearise, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import se3_inverse, so3_hat
 from geogs.geometry.robust import weighted_median
 from geogs.world.grid import SampleGrid
 
@@ -94,7 +95,8 @@ class Marginals:
     def beside(self, errors: Considered) -> "Marginals":
         """Add errors that are independent of these."""
         relative = (self.relative_depth.square() + errors.relative_depth).sqrt()
-        covariance, focal = self.covariance + errors.covariance, self.focal_variance + errors.focal
+        covariance = self.covariance + errors.covariance
+        focal = self.focal_variance + errors.focal
         return replace(self, covariance=covariance, relative_depth=relative, focal_variance=focal)
 
     @property
@@ -160,7 +162,8 @@ def common_errors(
     part = ThinnedProblem(grid, problem, cells)
     n = len(problem.T_cw)
     pull = torch.zeros(6 * n, 4 * PLACES[0] * PLACES[1], dtype=torch.float64)
-    place, owns = _places(part), []
+    place = _places(part)
+    owns = []
     for source, on_poses, own in _common_pulls(part, options, place):
         pull[source.edges.rows(n)] += on_poses / part.fraction
         owns.append(own)
@@ -189,10 +192,12 @@ def _common_pulls(
         unit = w * part.weight.clamp(min=1e-12).rsqrt()  # weight times one deviation
         onward = (j - i).sign() * COMMON_FLOW
         size = torch.stack([onward, torch.full_like(onward, COMMON_PLACE)])
-        pose, own = p.pose_jacobian * unit.mT[:, None], (p.depth_jacobian * unit).mT
+        pose = p.pose_jacobian * unit.mT[:, None]
+        own = (p.depth_jacobian * unit).mT
         sources = linearised_sources(flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(i), strict=True):
-            depth, chain = source.depth, source.edges.chain
+            depth = source.edges.depth
+            chain = source.edges.chain
             follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
             along = torch.einsum("se,ekap->asekp", size[:, e], pose[e]).flatten(0, 1).flatten(1, 2)
             owns = torch.einsum("se,eap->asp", size[:, e], own[e]).flatten(0, 1)
@@ -203,7 +208,8 @@ def _common_pulls(
 def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
     """Return one where a cell lies in a part of the image, else zero."""
     across, down = PLACES
-    camera, pixels = thinned.camera, thinned.pixels
+    camera = thinned.camera
+    pixels = thinned.pixels
     x, y = (pixels / pixels.new_tensor([camera.width, camera.height])).mT
     at = (y * down).long() * across + (x * across).long()
     return torch.nn.functional.one_hot(at, across * down).to(pixels)
@@ -231,7 +237,7 @@ def pose_covariance(problem: AnyProblem, H: Float[Tensor, "m m"]) -> Float[Tenso
 
 
 def _normalised_residual(
-    problem: AnyProblem, part: ThinnedProblem, options: BundleOptions
+    problem: AnyProblem, thinned: ThinnedProblem, options: BundleOptions
 ) -> Float[Tensor, "n"]:
     """Return the median residual from each frame; infinite without matches.
 
@@ -240,9 +246,17 @@ def _normalised_residual(
     better the more of it is bare.
     """
     found = torch.full((len(problem.T_cw),), torch.inf)
-    for frame, norm, information in part.residuals(options):
-        if len(norm):
-            found[frame] = weighted_median(norm, information.double())
+    for part in thinned.parts(options):
+        i, j = part.source, part.target
+        T_ji = relative_motion(part.T_cw, i, j)
+        at = project(thinned.camera, thinned.rays, T_ji, part.inverse_depth[i])
+        norm = residual_norms(at, part.pixels, part.weight)
+        used = at.valid & (part.weight[..., 0] > 0)
+        for frame, edges in sources_within(i):
+            own = used[edges]
+            if bool(own.any()):
+                information = part.weight[edges].sum(-1)[own].double()
+                found[frame] = weighted_median(norm[edges][own], information)
     return found
 
 
@@ -255,8 +269,61 @@ def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
 
 def _depth_variance(source: SourceFlow, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
     """Return variances of a source's inverse depths, by its matches and its poses' covariance."""
-    depth, rows = source.depth, source.edges.rows(len(covariance) // 6)
+    depth = source.edges.depth
+    rows = source.edges.rows(len(covariance) // 6)
     E = source.edges.chained_coupling()
     among = covariance[rows[:, None], rows].to(E)
     through_poses = (E * (among @ E)).sum(0) / depth.curvature.square()
     return torch.where(depth.information > 0, ALIKE / depth.curvature + through_poses, torch.inf)
+
+
+class PoseDeviations(NamedTuple):
+    """Standard deviations of poses, all axes together."""
+
+    position: Float[Tensor, "n"]
+    """Deviation of each camera's centre, in the unit of the poses."""
+    rotation: Float[Tensor, "n"]
+    """Deviation of each orientation, radians."""
+
+
+def deviations_after_alignment(
+    T_cw: Float[Tensor, "n 4 4"], covariance: Float[Tensor, "m m"]
+) -> PoseDeviations:
+    """Compute deviations of poses after removing the similarity that fits their errors best.
+
+    A trajectory is compared in this way with the truth, which has its own frame and unit. The
+    result does not depend on the pose and the length that were fixed for the covariance.
+
+    Args:
+        T_cw: world to camera, float64.
+        covariance: of the left perturbations (translation, then rotation) of all poses, m = 6n;
+            where it is not finite, deviations are infinite.
+
+    To first order, a perturbation moves a centre c by -R^T tau, and alignment removes from the
+    shifts of all centres their projection on those of a Sim(3), (I, -[c]x, c); from the rotations
+    in the world, -R^T phi, their mean, as the best-fitting rotation does.
+    """
+    n = len(T_cw)
+    R_wc = T_cw[:, :3, :3].mT
+    both = covariance.reshape(n, 2, 3, n, 2, 3)
+    moves, turns = (
+        torch.einsum("iab,ibjc,jdc->iajd", R_wc, both[:, k, :, :, k], R_wc).reshape(3 * n, 3 * n)
+        for k in (0, 1)
+    )
+    centres = se3_inverse(T_cw)[:, :3, 3]
+    centres = centres - centres.mean(0)
+    eye = torch.eye(3).to(T_cw).expand(n, 3, 3)
+    similarity = torch.cat([eye, -so3_hat(centres), centres[..., None]], 2).reshape(3 * n, 7)
+    return PoseDeviations(_left_over(moves, similarity), _left_over(turns, eye.reshape(3 * n, 3)))
+
+
+def _left_over(covariance: Float[Tensor, "m m"], J: Float[Tensor, "m k"]) -> Float[Tensor, "n"]:
+    """Return the deviation of each three numbers after removing the projection on J's columns."""
+    if not bool(covariance.isfinite().all()):
+        return covariance.new_full((len(covariance) // 3,), torch.inf)
+    Q, strength, _ = torch.linalg.svd(J, full_matrices=False)
+    # Cameras on a line can be rotated about it freely, cameras at one position only translated.
+    Q = Q[:, strength > 1e-9 * strength.max()]
+    rest = covariance - Q @ (Q.mT @ covariance)
+    variance = rest.diagonal() - ((rest @ Q) * Q).sum(1)
+    return variance.reshape(-1, 3).sum(1).clamp(min=0).sqrt()

@@ -4,18 +4,17 @@ Linearised on the CPU, some edges at a time, whatever the device of the matches.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import SourceFlow, linearised_sources, residual_norms
+from geogs.bundle.flow_term import FlowTerm, SourceFlow, linearised_sources
 from geogs.bundle.hyper_edge import DepthEquations
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
-from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
-from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState, DepthTerm
 from geogs.world.grid import SampleGrid
@@ -28,7 +27,8 @@ class ThinnedProblem:
 
     def __init__(self, grid: SampleGrid, problem: AnyProblem, cells: int) -> None:
         step = -(-grid.size // cells)
-        self._problem, self._cells = problem, slice(None, None, step)
+        self._problem = problem
+        self._cells = slice(None, None, step)
         self.camera, self.rays = grid.camera, grid.rays[self._cells].cpu()
         self.pixels = grid.pixels[self._cells].cpu()
         self.lens = LensBlock(grid.camera, self.pixels)
@@ -36,11 +36,12 @@ class ThinnedProblem:
         self.fraction = self.count / grid.size
         self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
 
-    def sources(self, options: BundleOptions) -> Iterator[SourceFlow]:
-        """Yield all linearised sources, in order."""
-        flow = LensFlow(self.lens)
+    def sources(self, options: BundleOptions, flow: FlowTerm | None = None) -> Iterator[SourceFlow]:
+        """Yield all linearised sources, in order; by default of the known lens."""
+        flow = flow or LensFlow(self.lens)
         for part in self.parts(options):
-            yield from linearised_sources(flow, part, part.start, options)
+            state = replace(part.start, block=self.lens)
+            yield from linearised_sources(flow, part, state, options)
 
     def depth_moves(
         self, source: SourceFlow, pull: Float[Tensor, "c k"], moves: Float[Tensor, "m k"]
@@ -50,38 +51,31 @@ class ThinnedProblem:
         They are ``C^-1 (pull - E^T moves)`` over the inverse depths, with the gradients ``pull`` on
         the depths and the ``moves`` of all poses. Zero for fixed depths, or without a match.
         """
-        depth, rows = source.depth, source.edges.rows(len(moves) // 6)
+        depth = source.edges.depth
+        rows = source.edges.rows(len(moves) // 6)
         left = pull - source.edges.chained_coupling().mT @ moves[rows].to(pull)
         scale = depth.curvature * self.inverse_depth[source.frame].clamp(min=1e-12)
         known = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
         return torch.where(known[:, None], left / scale[:, None], 0.0)
 
-    def residuals(
-        self, options: BundleOptions
-    ) -> Iterator[tuple[int, Float[Tensor, "m"], Float[Tensor, "m"]]]:
-        """Yield each source in order, norms of its matches' residuals in standard deviations, and
-        the information of these matches, summed over both axes, 1 / pixel^2."""
-        for part in self.parts(options):
-            i, j = part.source, part.target
-            T_ji = relative_motion(part.T_cw, i, j)
-            at = project(self.camera, self.rays, T_ji, self.inverse_depth[i])
-            norm = residual_norms(at, part.pixels, part.weight)
-            used = at.valid & (part.weight[..., 0] > 0)
-            for frame, edges in sources_within(i):
-                own = used[edges]
-                yield frame, norm[edges][own], part.weight[edges].sum(-1)[own]
-
     def parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
         """Yield problems of some edges at a time, with the depth terms."""
-        p, cells = self._problem, self._cells
+        p = self._problem
+        cells = self._cells
         terms = tuple(_ThinnedTerm(term, p.start, cells) for term in p.depth_terms)
         for chunk in source_chunks(p.source.cpu(), options.chunk):
             part = p.part(chunk)
             yield BundleProblem(
-                p.T_cw.cpu(), self.inverse_depth, part.source.cpu(), part.target.cpu(),
-                p.free_pose.cpu(), p.free_depth.cpu(), terms,
-                pixels=part.pixels[:, cells].cpu(), weight=part.weight[:, cells].cpu(),
-            )  # fmt: skip
+                p.T_cw.cpu(),
+                self.inverse_depth,
+                part.source.cpu(),
+                part.target.cpu(),
+                p.free_pose.cpu(),
+                p.free_depth.cpu(),
+                terms,
+                pixels=part.pixels[:, cells].cpu(),
+                weight=part.weight[:, cells].cpu(),
+            )
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from geogs.bundle.flow_term import (
     linearised_sources,
     weighed_residuals,
 )
-from geogs.bundle.hyper_edge import DepthEquations, HyperEdge, RelativeEdges
+from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import carried_over, linearise, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -52,32 +52,30 @@ COUNTS = 0.1
 
 
 class LensChange(Enum):
-    """Parameters of a lens that may change from frame to frame."""
+    """Parameters of a lens that may change from frame to frame, as indices into
+    :attr:`VaryingPrior.deviations`."""
 
-    FOCAL = "focal length"
-    CENTRE = "principal point"
+    FOCAL = 0, 3
+    CENTRE = 1, 2
 
 
 @dataclass(frozen=True)
 class VaryingPrior:
-    """Prior on per-frame intrinsics: white noise, plus a random walk of the focal length. Standard
-    deviations, estimated from the video; zero for parameters that do not vary."""
+    """Prior on per-frame intrinsics: white noise, plus a random walk of the focal length."""
 
-    jitter: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Deviation of each parameter of a frame."""
-    drift: float = 0.0
-    """Deviation of the logarithm of the last frame's focal length from the first one's."""
+    deviations: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """Deviation of each parameter of a frame, and that of the logarithm of the last frame's focal
+    length from the first one's; estimated from the video, zero where nothing varies."""
 
     def varies(self, change: LensChange) -> bool:
         """Whether a parameter varies."""
-        return self.jitter[0 if change is LensChange.FOCAL else 1] > 0
+        return self.deviations[change.value[0]] > 0
 
     def also(self, change: LensChange) -> "VaryingPrior":
         """Return the prior with another varying parameter, with its initial deviation."""
-        focal, *centre = self.jitter
-        if change is LensChange.FOCAL:
-            return VaryingPrior((FIRST_DEVIATION, centre[0], centre[1]), FIRST_DEVIATION)
-        return VaryingPrior((focal, FIRST_DEVIATION, FIRST_DEVIATION), self.drift)
+        free = change.value
+        each = enumerate(self.deviations)
+        return VaryingPrior(tuple(FIRST_DEVIATION if n in free else size for n, size in each))
 
     def information(self, times: Float[Tensor, "n"]) -> Float[Tensor, "3 n n"]:
         """Return the inverse covariance of each parameter at some times; they are independent."""
@@ -88,7 +86,7 @@ class VaryingPrior:
 
     @property
     def _squares(self) -> list[float]:
-        return [max(LEAST, size) ** 2 for size in (*self.jitter, self.drift)]
+        return [max(LEAST, size) ** 2 for size in self.deviations]
 
     def between(
         self, known: Float64[np.ndarray, "n"], times: Float64[np.ndarray, "m"]
@@ -96,7 +94,8 @@ class VaryingPrior:
         """Return deviations of frames at some times from values interpolated between those at
         ``known`` times: of a Brownian bridge plus white noise."""
         after = np.searchsorted(known, times).clip(1, len(known) - 1)
-        before, length = known[after - 1], max(known[-1] - known[0], 1e-9)
+        before = known[after - 1]
+        length = max(known[-1] - known[0], 1e-9)
         span = np.maximum(known[after] - before, 1e-9)
         part = ((times - before) / span).clip(0, 1)
         squares = np.tile(self._squares[:3], (len(times), 1))
@@ -111,23 +110,25 @@ class VaryingPrior:
     ) -> "VaryingPrior":
         """Take one EM update of the variances, given parameters with their covariance. Parameters
         that do not vary stay fixed."""
-        prior, squares = self.information(times), self._squares
+        prior = self.information(times)
         found = []
-        for n, (part, square) in enumerate(zip(_parts(times), squares, strict=True)):
+        for n, (part, square) in enumerate(zip(_parts(times), self._squares, strict=True)):
+            if self.deviations[n] == 0:
+                found.append(0.0)
+                continue
             k = n % len(OWN)
             second = sizes[:, k, None] * sizes[:, k] + covariance[:, k, :, k]
             both = prior[k] @ part
             less = ((both @ prior[k]) * second.mT).sum() - both.diagonal().sum()
             found.append(math.sqrt(max(LEAST**2, square + square**2 / len(times) * float(less))))
-        varying = [size > 0 for size in (*self.jitter, self.drift)]
-        found = [size if varies else 0.0 for size, varies in zip(found, varying, strict=True)]
-        return VaryingPrior((found[0], found[1], found[2]), found[3])
+        return VaryingPrior(tuple(found))
 
 
 def _parts(times: Float[Tensor, "n"]) -> list[Float[Tensor, "n n"]]:
     """Return unit covariances: of white noise for each parameter, and of a random walk."""
     alone = torch.eye(len(times), dtype=torch.float64)
-    first, last = times.min(), times.max()  # a saved map's frames may be of later times
+    first = times.min()  # a saved map's frames may be of later times
+    last = times.max()
     past = (times - first).double() / (last - first).clamp(min=1e-9)
     return [alone, alone, alone, torch.minimum(past[:, None], past)]
 
@@ -174,7 +175,8 @@ class VaryingEvidence:
     ) -> tuple[Float[Tensor, "k"], VaryingPrior]:
         """Return steps as in :meth:`solved`, and the prior estimated with them by EM, starting from
         ``prior``."""
-        frames, own = len(times), len(self.gradient) - SHAPES
+        frames = len(times)
+        own = len(self.gradient) - SHAPES
         for _ in range(EXPECTATIONS):
             step, covariance = self.solved(times, taken, prior, shared)
             open_ = covariance[:own, :own].reshape(frames, len(OWN), frames, len(OWN))
@@ -184,7 +186,8 @@ class VaryingEvidence:
     def explained(self, step: Float[Tensor, "k"]) -> float:
         """Return the relative cost reduction of a step beyond that of the shared lens alone."""
         less = 2 * self.gradient @ step - step @ self.information @ step
-        H, g = self.information[-SHAPES:, -SHAPES:], self.gradient[-SHAPES:]
+        H = self.information[-SHAPES:, -SHAPES:]
+        g = self.gradient[-SHAPES:]
         damping = torch.diag(1e-9 * H.diagonal() + 1e-12)
         alone = g @ torch.linalg.solve(H + damping, g)
         return float(less - alone) / max(self.cost, 1e-12)
@@ -196,7 +199,7 @@ def varying_evidence(
     """Compute the evidence of a problem's matches, at its solution, on the lens of each frame.
 
     None where they do not determine all poses. Parameters are errors for which matches are to be
-    corrected (:func:`~geogs.bundle.uncertainty.lens_error.shape_shifts`).
+    corrected (:func:`~geogs.bundle.uncertainty.lens_error.shifts_of_edges`).
 
     Args:
         grid: of the depths.
@@ -205,19 +208,24 @@ def varying_evidence(
         cells: most cells of a frame that are used; they represent the others.
     """
     thinned = ThinnedProblem(grid, problem, cells)
-    n, own = len(problem.T_cw), len(OWN)
-    size, sizes = 6 * n, own * n + SHAPES
+    n = len(problem.T_cw)
+    own = len(OWN)
+    size = 6 * n
+    sizes = own * n + SHAPES
     poses = torch.zeros(size, size, dtype=torch.float64)
-    both, information = poses.new_zeros(size, sizes), poses.new_zeros(sizes, sizes)
-    descent, gradient = poses.new_zeros(size), poses.new_zeros(sizes)
-    flow, cost = OwnLensFlow(thinned), 0.0
+    both = poses.new_zeros(size, sizes)
+    information = poses.new_zeros(sizes, sizes)
+    descent = poses.new_zeros(size)
+    gradient = poses.new_zeros(sizes)
+    flow = OwnLensFlow(thinned)
+    cost = 0.0
     for part in thinned.parts(options):
-        state = BundleState(part.T_cw, part.inverse_depth)
-        cost += flow.cost(part, state, options.huber)
-        for source in linearised_sources(flow, part, state, options):
+        cost += flow.cost(part, part.start, options.huber)
+        for source in linearised_sources(flow, part, part.start, options):
             edges = source.edges
             H, g = edges.chained()
-            rows, lens = edges.rows(n)[: len(g) - edges.shared], _places(edges.poses, n)
+            rows = edges.rows(n)[: len(g) - edges.shared]
+            lens = _places(edges.poses, n)
             c = len(rows)
             poses[rows[:, None], rows] += H[:c, :c]
             both[rows[:, None], lens] += H[:c, c:]
@@ -255,35 +263,22 @@ def considered_lenses(
         times: of the frames.
         shared: prior deviations of the shared lens.
     """
-    zero, n = torch.zeros_like(evidence.gradient), len(times)
+    zero = torch.zeros_like(evidence.gradient)
+    n = len(times)
     prior = FIRST
     for _ in range(EXPECTATIONS):
         prior = prior.suited(times, own, own.new_zeros(n, len(OWN), n, len(OWN)))
     _, left = evidence.solved(times, zero, prior, shared)
     thinned = ThinnedProblem(grid, problem, cells)
     relative = torch.zeros(n, thinned.count)
-    flow = OwnLensFlow(thinned)
-    for part in thinned.parts(options):
-        state = BundleState(part.T_cw, part.inverse_depth)
-        for source in linearised_sources(flow, part, state, options):
-            edges = source.edges
-            assert edges.depth is not None
-            lens = _places(edges.poses, n)
-            pull = edges.depth.coupling.new_zeros(thinned.count, len(zero))
-            pull[:, lens] = -edges.depth.coupling[-edges.shared :].mT
-            alone = replace(source, edges=_of_poses(edges))
-            moved = thinned.depth_moves(alone, pull, evidence.moves)
-            relative[source.frame] = ((moved @ left.to(moved)) * moved).sum(-1)
+    for source in thinned.sources(options, OwnLensFlow(thinned)):
+        coupling = source.edges.depth.coupling
+        pull = coupling.new_zeros(thinned.count, len(zero))
+        pull[:, _places(source.edges.poses, n)] = -coupling[-source.edges.shared :].mT
+        alone = replace(source, edges=source.edges.of_poses())
+        moved = thinned.depth_moves(alone, pull, evidence.moves)
+        relative[source.frame] = ((moved @ left.to(moved)) * moved).sum(-1)
     return Considered(evidence.moves @ left @ evidence.moves.mT, relative)
-
-
-def _of_poses(edges: HyperEdge) -> HyperEdge:
-    """Return the edges without shared unknowns."""
-    assert edges.depth is not None
-    size = len(edges.gradient) - edges.shared
-    depth = replace(edges.depth, coupling=edges.depth.coupling[:size])
-    H, g = edges.hessian[:size, :size], edges.gradient[:size]
-    return replace(edges, hessian=H, gradient=g, shared=0, depth=depth)
 
 
 def _places(poses: Int[Tensor, "e"], frames: int) -> Int[Tensor, "m"]:
@@ -293,36 +288,42 @@ def _places(poses: Int[Tensor, "e"], frames: int) -> Int[Tensor, "m"]:
     return torch.cat([each, own * frames + torch.arange(SHAPES)])
 
 
+@dataclass(frozen=True)
 class OwnLensFlow:
     """Dense flow of a pinhole's cells, with per-frame and shared errors of the lens."""
 
-    def __init__(self, thinned: ThinnedProblem) -> None:
-        self._camera, self._rays, self._pixels = thinned.camera, thinned.rays, thinned.pixels
+    thinned: ThinnedProblem
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
         """Yield sources as in the protocol; shared unknowns are the parameters of the targets, of
         the source, then of the shared lens."""
-        camera, own = self._camera, list(OWN)
+        camera = self.thinned.camera
+        rays = self.thinned.rays
+        own = list(OWN)
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
-        p = linearise(camera, self._rays, T_ji, state.inverse_depth[problem.source])
+        p = linearise(camera, rays, T_ji, state.inverse_depth[problem.source])
         r, w = weighed_residuals(p, problem.pixels, problem.weight, options.huber)
-        there, here = lens_shapes(camera, p.pixels), lens_shapes(camera, self._pixels)
-        here = carried_over(camera, self._rays, T_ji, p, here[:, None].expand_as(there))
+        there, here = lens_shapes(camera, p.pixels), lens_shapes(camera, self.thinned.pixels)
+        here = carried_over(camera, rays, T_ji, p, here[:, None].expand_as(there))
         # A shift added to a match is subtracted from the cell's projection.
         moved = torch.cat([-there[own], here[own], here - there]).permute(1, 0, 3, 2)
         J = torch.cat([p.pose_jacobian, moved], 1)
-        wJ, by_depth = J * w.mT[:, None], p.depth_jacobian.mT[:, None]
+        wJ = J * w.mT[:, None]
+        by_depth = p.depth_jacobian.mT[:, None]
         H = (wJ.flatten(2) @ J.flatten(2).mT).double()
         g = (wJ.flatten(2) @ r.mT.flatten(1)[..., None])[..., 0].double()
-        E, adjoint = (wJ * by_depth).sum(2), se3_adjoint(T_ji)
+        E = (wJ * by_depth).sum(2)
+        adjoint = se3_adjoint(T_ji)
         wd = w * p.depth_jacobian
-        C, b = (wd * p.depth_jacobian).sum(-1), (wd * r).sum(-1)
+        C = (wd * p.depth_jacobian).sum(-1)
+        b = (wd * r).sum(-1)
         for frame, e in sources_within(problem.source):
             at = _edge_places(e.stop - e.start, len(OWN), J.shape[1])
             size = int(at.max()) + 1
-            hessian, gradient = H.new_zeros(size, size), H.new_zeros(size)
+            hessian = H.new_zeros(size, size)
+            gradient = H.new_zeros(size)
             coupling = E.new_zeros(size, E.shape[2])
             for n, edge in zip(at, range(e.start, e.stop), strict=True):
                 hessian[n[:, None], n] += H[edge]
@@ -342,7 +343,8 @@ class OwnLensFlow:
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
         """Return the cost as in the protocol, with present weights."""
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
-        p = project(self._camera, self._rays, T_ji, state.inverse_depth[problem.source])
+        depth = state.inverse_depth[problem.source]
+        p = project(self.thinned.camera, self.thinned.rays, T_ji, depth)
         r, w = weighed_residuals(p, problem.pixels, problem.weight, huber)
         return float((w * r.square()).double().sum())
 

@@ -81,7 +81,9 @@ def _agreed(
     before: Float[np.ndarray, "gh gw 2"], after: Float[np.ndarray, "gh gw 2"], fraction: float
 ) -> Float[np.ndarray, "gh gw 2"]:
     """Mean of the two, shrunk the more they differ: flow that fails differs."""
-    mean, change = before + fraction * (after - before), after - before
-    square, error = (mean**2).sum(2, keepdims=True), (change**2).sum(2, keepdims=True)
+    mean = before + fraction * (after - before)
+    change = after - before
+    square = (mean**2).sum(2, keepdims=True)
+    error = (change**2).sum(2, keepdims=True)
     weight: Float[np.ndarray, "gh gw 1"] = square / np.maximum(square + error, 1e-12)
     return weight * mean

@@ -1,14 +1,24 @@
-"""Angular velocity of a camera between two images of a video, from their flow."""
+"""Angular velocity of a camera at the images of a video, from the flow between neighbours."""
 
 import threading
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, pairwise
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from geogs.camera.shutter.angular_motion import rotated
+from geogs.camera.shutter.angular_motion import (
+    AngularMotion,
+    AngularStep,
+    angular_motion_between,
+    rotated,
+)
 from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.threads import Each
 
 LONG_EDGE = 256
 """Largest long edge, in pixels, of the images for flow."""
@@ -18,7 +28,6 @@ BORDER = 2
 """Pixels from the border within which flow ends are not used."""
 TOLERANCE = 0.004
 """Radians by which a cell may differ from rotation before it loses half of its weight."""
-ROUNDS = 10
 SMOOTH = 1.0
 """Standard deviation of the smoothing of parallax, in cells."""
 AGREEING = 0.2
@@ -79,7 +88,8 @@ class FlowMeter:
         last = width - 1 - BORDER, height - 1 - BORDER
         inside = ((ends >= BORDER) & (ends <= last)).all(1)
         ends = np.where(inside[:, None], ends, self._pixels)
-        rays, times = self._camera.rays(ends), self._camera.line_times(ends)
+        rays = self._camera.rays(ends)
+        times = self._camera.line_times(ends)
         return RayFlow(self._rays, rays, self._times, times, inside, ends, self._cells[0].shape)
 
 
@@ -104,11 +114,18 @@ def angular_velocity(
     """
     from geogs.camera.shutter.turning_kernels import turning_between
 
-    first_time, second_time = readout * flow.first_time, readout * flow.second_time
+    first_time = readout * flow.first_time
+    second_time = readout * flow.second_time
     rate, error = turning_between(
-        flow.first, flow.second, first_time, second_time, flow.inside.astype(np.float64),
-        interval, TOLERANCE, ROUNDS,
-    )  # fmt: skip
+        flow.first,
+        flow.second,
+        first_time,
+        second_time,
+        flow.inside.astype(np.float64),
+        interval,
+        tolerance=TOLERANCE,
+        rounds=10,
+    )
     agreeing = (flow.inside & (error < 2 * TOLERANCE)).mean()
     return rate if agreeing >= AGREEING else None
 
@@ -152,8 +169,87 @@ def _spread(
     field: Float[np.ndarray, "gh gw 2"], known: Bool[np.ndarray, "n"], cells: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "gh gw 2"]:
     """Move each value to its cell, then average the known values around each cell."""
-    shape, count = field.shape[:2], len(cells)
+    shape = field.shape[:2]
+    count = len(cells)
     values = (known, *(known * part for part in field.reshape(-1, 2).T))
     laid = (np.bincount(cells, part, count).reshape(shape) for part in values)
     weight, *sums = (cv2.GaussianBlur(part, (0, 0), SMOOTH) for part in laid)
     return np.dstack(sums) / np.maximum(weight, 1e-3)[..., None]
+
+
+@runtime_checkable
+class Image(Protocol):
+    """An image of a video."""
+
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        ...
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        """RGB, of the camera whose motion is estimated; None if it could not be read."""
+        ...
+
+
+Picture = TypeVar("Picture", bound=Image)
+
+
+def with_angular_motion(
+    images: Iterable[Picture],
+    camera: RollingCamera,
+    readout: float,
+    wanted: Callable[[int], bool],
+    each: Each = map,
+) -> Iterator[tuple[Picture, AngularMotion]]:
+    """Yield the wanted images, each with the angular motion of the camera.
+
+    The result depends on an image and its two neighbours alone, so it is the same wherever reading
+    begins.
+
+    Args:
+        images: neighbours in the video.
+        camera: that took them.
+        readout: seconds from the first to the last row.
+        wanted: whether the image at position 0, 1, 2, ... is wanted.
+        each: maps flow measurement over pairs of neighbours; with ``map`` one image more than the
+            one yielded has been read by then.
+    """
+    meter = FlowMeter(camera)
+    seen = (
+        _Seen(image, None if image.image is None else meter.small(image.image), wanted(position))
+        for position, image in enumerate(images)
+    )
+    before: AngularStep | None = None
+    for here, after in each(partial(_step, meter, readout), pairwise(chain(seen, [None]))):
+        if here.is_wanted:
+            yield here.image, angular_motion_between(before, after)
+        before = after
+
+
+@dataclass(frozen=True)
+class _Seen(Generic[Picture]):
+    """An image, its small version for flow, and whether its motion is wanted."""
+
+    image: Picture
+    small: UInt8[np.ndarray, "h w"] | None
+    is_wanted: bool
+
+
+def _step(
+    meter: FlowMeter, readout: float, pair: tuple[_Seen[Picture] | None, _Seen[Picture] | None]
+) -> tuple[_Seen[Picture], AngularStep | None]:
+    """Return the first of two neighbours, with the motion to the second; None where it is unknown
+    or not wanted. The last image has no second."""
+    first, second = pair
+    assert first is not None
+    if second is None or not (first.is_wanted or second.is_wanted):
+        return first, None
+    interval = second.image.timestamp - first.image.timestamp
+    if first.small is None or second.small is None or interval <= 0:
+        return first, None
+    flow = meter.measure(first.small, second.small)
+    rate = angular_velocity(flow, interval, readout)
+    if rate is None:
+        return first, None
+    return first, AngularStep(rate, interval, parallax(flow, rate, interval, readout))

@@ -13,8 +13,6 @@ from geogs.types import SeenRows
 
 CELL = 8
 """Pixels between two nodes; offsets are interpolated between them."""
-ROUNDS = 3
-"""Rounds of the fixed point of row and time: an error shrinks some 50 times a round."""
 
 
 def node_count(pixels: int) -> int:
@@ -31,7 +29,8 @@ class RowOffsets:
     """
 
     def __init__(self, rolling: RollingCamera, rectified: Camera) -> None:
-        self._rolling, self._rectified = rolling, rectified
+        self._rolling = rolling
+        self._rectified = rectified
         # One more cell on every side, so that all pixels lie between nodes.
         columns = (np.arange(node_count(rectified.width)) - 1) * CELL + (CELL - 1) / 2
         lines = (np.arange(node_count(rectified.height)) - 1) * CELL + (CELL - 1) / 2
@@ -49,14 +48,15 @@ class RowOffsets:
             motion: of the camera, at this image.
             readout: seconds from the first to the last row.
         """
-        pixels, velocity = self._still, None
+        pixels = self._still
+        velocity = None
         if motion.parallax is not None:
             velocity = self._sampled(motion.parallax)
             # The part due to the rate's change within a readout is not parallax.
             error = abs(readout) * np.linalg.norm(motion.acceleration)
             square = (velocity**2).sum(1, keepdims=True)
             velocity *= square / np.maximum(square + error**2, 1e-12)
-        for _ in range(ROUNDS):
+        for _ in range(3):  # fixed point of row and time: an error shrinks some 50 times a round
             times = readout * self._rolling.line_times(pixels)
             rays = rotated(self._rays, motion.angles(times))
             if velocity is not None:
@@ -71,9 +71,12 @@ class RowOffsets:
         size = np.array([camera.width, camera.height]) / [columns, lines]
         cells = ((self._still + 0.5) / size - 0.5).astype(np.float32)
         values = cv2.remap(
-            field.astype(np.float32), cells[:, None, :1], cells[:, None, 1:], cv2.INTER_LINEAR,
+            field.astype(np.float32),
+            cells[:, None, :1],
+            cells[:, None, 1:],
+            cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
+        )
         return values[:, 0].astype(np.float64)
 
     def dense(self, nodes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "h w 2"]:
@@ -91,9 +94,11 @@ class RowOffsets:
             nodes: offsets in pixels of the rolling image at the nodes.
             shutter: their shutter.
         """
-        pixels, target = self._still + nodes, self._rectified
+        pixels = self._still + nodes
+        target = self._rectified
         rays = self._rolling.rays(pixels)
-        focal, centre = [target.fx, target.fy], [target.cx, target.cy]
+        focal = [target.fx, target.fy]
+        centre = [target.cx, target.cy]
         offset = rays[:, :2] / rays[:, 2:] * focal + centre - self._pixels
         seconds = shutter.readout * self._rolling.line_times(pixels)
         return SeenRows(

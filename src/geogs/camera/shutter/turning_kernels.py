@@ -11,8 +11,6 @@ from numba import njit
 _EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
 _SMALL = 1e-4
 """Radians below which sine and cosine are taken from their series, exact to 1e-16 there."""
-_POLAR = 30
-"""Most iterations to the nearest rotation; ten are usual."""
 
 
 @njit(**_EXACT)
@@ -27,9 +25,11 @@ def turn(vectors, by, out):
         square = a * a + b * b + c * c
         angle = np.sqrt(square)
         if angle > _SMALL:
-            sine, cosine = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+            sine = np.sin(angle) / angle
+            cosine = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
         else:
-            sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+            sine = 1.0 - square / 6.0
+            cosine = 0.5 - square / 24.0
         ox, oy, oz = b * z - c * y, c * x - a * z, a * y - b * x
         out[n, 0] = x + sine * ox + cosine * (b * oz - c * oy)
         out[n, 1] = y + sine * oy + cosine * (c * ox - a * oz)
@@ -42,15 +42,17 @@ def nearest_turn(matrix):
 
     Source: the polar decomposition by Newton's iteration (Higham 1986).
     """
-    other, largest = np.empty((3, 3)), 0.0
+    other = np.empty((3, 3))
+    largest = 0.0
     for i in range(3):
         for j in range(3):
             largest = max(largest, abs(matrix[i, j]))
-    for _ in range(_POLAR):
+    for _ in range(30):  # ten are usual
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
             for m in range(3):
-                n, o = (m + 1) % 3, (m + 2) % 3
+                n = (m + 1) % 3
+                o = (m + 2) % 3
                 other[i, m] = matrix[j, n] * matrix[k, o] - matrix[j, o] * matrix[k, n]
         determinant = 0.0
         for i in range(3):
@@ -85,9 +87,14 @@ def turning_between(first, second, first_time, second_time, inside, interval, to
     Returns:
         the rate (3), radians per second, and the residual of each ray (n), radians.
     """
-    rate, moment, weight = np.zeros(3), np.empty((3, 3)), inside.copy()
-    a, b, error = np.empty_like(first), np.empty_like(second), np.empty_like(weight)
-    first_turn, second_turn = np.empty_like(first), np.empty_like(second)
+    rate = np.zeros(3)
+    moment = np.empty((3, 3))
+    weight = inside.copy()
+    a = np.empty_like(first)
+    b = np.empty_like(second)
+    error = np.empty_like(weight)
+    first_turn = np.empty_like(first)
+    second_turn = np.empty_like(second)
     for _ in range(rounds):
         for n in range(len(weight)):
             for i in range(3):
@@ -109,7 +116,9 @@ def turning_between(first, second, first_time, second_time, inside, interval, to
         cosine = moment[0, 0] + moment[1, 1] + moment[2, 2] - 1.0
         factor = np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.5
         factor /= interval
-        rate[0], rate[1], rate[2] = factor * x, factor * y, factor * z
+        rate[0] = factor * x
+        rate[1] = factor * y
+        rate[2] = factor * z
         for n in range(len(error)):
             square = 0.0
             for i in range(3):

@@ -5,18 +5,17 @@ A program that imports geogs keeps its own state: none of this is done for it.
 
 import atexit
 import gc
+import io
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType
+from typing import TextIO
 
 from geogs.application.interrupt import handled_signals, interrupt
-from geogs.cli.terminal.streams import make_unbreakable
-
-_IMPORTED = 500_000
-"""Number of objects above that of a run's imports: 330,000, with SciPy and Numba 450,000."""
 
 
 def take_over() -> None:
@@ -50,7 +49,8 @@ def _leave_imports_alone() -> None:
             gc.set_threshold(*usual)
 
     gc.callbacks.append(imported)
-    gc.set_threshold(_IMPORTED, *usual[1:])
+    # Number of objects above that of a run's imports: 330,000, with SciPy and Numba 450,000.
+    gc.set_threshold(500_000, *usual[1:])
 
 
 def show_warnings() -> None:
@@ -87,3 +87,55 @@ def _handle_signals(handler: Callable[[int, FrameType | None], None] | signal.Ha
     if threading.current_thread() is threading.main_thread():
         for number in handled_signals():
             signal.signal(number, handler)
+
+
+def make_unbreakable() -> None:
+    """Replace the streams of the process by ones that drop output that cannot be written.
+
+    Closed descriptors 0 to 2 are opened to the null device first, so that no file of a result gets
+    one of them, and with it the output of libraries. Characters unknown to a terminal are written
+    as escapes. Streams that were replaced already stay.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)  # gets the smallest number that is free
+    if sys.stdout is sys.__stdout__:
+        sys.stdout = _unbreakable(1, sys.stdout)
+    if sys.stderr is sys.__stderr__:
+        sys.stderr = _unbreakable(2, sys.stderr)
+
+
+class _Dropping(io.RawIOBase):
+    """Writes to a descriptor; output that fails is lost."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._number
+
+    def isatty(self) -> bool:
+        return os.isatty(self._number)
+
+    def write(self, data: object) -> int:
+        view = memoryview(data).cast("B")  # type: ignore[arg-type]
+        try:
+            return os.write(self._number, view)
+        except OSError:
+            return len(view)
+
+
+def _unbreakable(number: int, before: TextIO | None) -> TextIO:
+    encoding = getattr(before, "encoding", None) or "utf-8"
+    with suppress(OSError, ValueError):
+        if before is not None:
+            before.flush()
+    # A duplicate: decoder noise is caught by redirecting the original number meanwhile.
+    buffer = io.BufferedWriter(_Dropping(os.dup(number)))
+    return io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=True)

@@ -12,6 +12,8 @@ from geogs.errors import TrackingLost
 if TYPE_CHECKING:
     from geogs.application.progress.run_progress import RunProgress
     from geogs.application.results.result import Result
+    from geogs.io.sources.frame_source import Source
+    from geogs.io.sources.posed.posed_source import PosedSource
 
 
 NOT_JUDGED = "Reliability unknown: the run was interrupted before the final adjustment."
@@ -22,6 +24,11 @@ def say_loading(options: Verbosity) -> None:
     """Show a loading message on a terminal; the first progress report overwrites it."""
     if not options.quiet and sys.stderr is not None and sys.stderr.isatty():
         print("loading ...", end="\r", file=sys.stderr, flush=True)
+
+
+def say_input(source: "Source | PosedSource") -> None:
+    """Print what an input holds and how it is read, for ``--dry-run``."""
+    print("\n".join(source.account.lines(source.found)))
 
 
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "Result":
@@ -43,7 +50,12 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "
         result = work(progress)
         progress.end_phase()
         words = closing_message(result, time.perf_counter() - begin)
-        words += _remedy(options, result)
+        if isinstance(options, RunSettings) and not result.is_interrupted:
+            from geogs.application.remedy import remedy
+
+            took = result.scene.stopwatch.total
+            said = remedy(options, result.source, result.verdict, took)
+            words += [f"What may help: {said}"] if said else []
         progress.note("\n".join(words))
     if not options.quiet:
         print("\n".join(words))
@@ -51,16 +63,6 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "
         why = result.why_no_map or "Of what was seen no surface is known."
         raise TrackingLost(f"There is no mesh; the rest is in {result.folder}/. {why}")
     return result
-
-
-def _remedy(options: Verbosity, result: "Result") -> list[str]:
-    """Suggested command, where a finished run is not reliable."""
-    from geogs.application.remedy import remedy
-
-    if not isinstance(options, RunSettings) or result.is_interrupted:
-        return []
-    said = remedy(options, result.source, result.verdict, result.scene.stopwatch.total)
-    return [f"What may help: {said}"] if said else []
 
 
 def closing_message(result: "Result", seconds: float) -> list[str]:

@@ -3,21 +3,26 @@
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from geogs.depth.cuda.edges import resolve_edges
-from geogs.depth.cuda.far_side import farther_surface
-from geogs.depth.cuda.fusion import check, vote
-from geogs.depth.cuda.grid_completion import can_complete, complete
+from geogs.depth import evidence, grid_completion
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
-from geogs.depth.cuda.photo_vote import photo_costs
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
-from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
+from geogs.depth.cuda.refinement import (
+    PixelPositions,
+    TrackerMaps,
+    choose_start,
+    judge,
+    refine,
+    resolve_edges,
+)
+from geogs.depth.cuda.revision import check, farther_surface, photo_costs, vote
 from geogs.depth.depth_engine import DepthTask, Progress, silent
 from geogs.depth.depth_view import (
     DenseDepth,
@@ -32,12 +37,15 @@ from geogs.depth.grid_completion import complete_grid, edge_weights, known_cells
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
+from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import upload
 from geogs.threads import worker_count
 from geogs.world.lru import LruCache
 
 # Keyframes whose grids are completed at once.
 _BATCH = 32
+SOURCE = Path(__file__).with_name("completion.cu")
+_PANEL = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +69,7 @@ class CudaDepthEngine:
     """
 
     def __init__(
-        self,
-        device: torch.device,
-        render: Camera,
-        working: Camera,
-        resident: int,
-        planes: int,
+        self, device: torch.device, render: Camera, working: Camera, resident: int, planes: int
     ) -> None:
         self.device = device
         self.render = render
@@ -133,7 +136,8 @@ class CudaDepthEngine:
         """As in the protocol; at most 16 others are used."""
         others = others[:MAX_NEIGHBOURS]
         images = [self._images_of(v) for v in others]
-        own, poses = self._images_of(view), relative_poses(view, others)
+        own = self._images_of(view)
+        poses = relative_poses(view, others)
         return photo_costs(own, images, poses, depths, same, self.render, mask)
 
     def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
@@ -142,16 +146,18 @@ class CudaDepthEngine:
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, uploaded at their first use."""
-        return self._images.get(view.id, partial(self._bring, view))
 
-    def _bring(self, view: DepthView) -> KeyframeImages:
-        prepared = self._pixels.pop(view.id, None)
-        pixels = None if prepared is None else prepared.result()
-        return KeyframeImages.of(view, self.device, pixels)
+        def bring() -> KeyframeImages:
+            prepared = self._pixels.pop(view.id, None)
+            pixels = None if prepared is None else prepared.result()
+            return KeyframeImages.of(view, self.device, pixels)
+
+        return self._images.get(view.id, bring)
 
     def _plan(self, task: DepthTask) -> SearchPlan:
         reference, neighbours, limits = task
-        grid, information = reference.inverse_depth, reference.information
+        grid = reference.inverse_depth
+        information = reference.information
         known = known_cells(grid, information)
         typical = float(np.median(grid[known])) if known.any() else 0.0
         grids = np.stack([grid, information, self._edges[reference.id].result()])
@@ -164,7 +170,8 @@ class CudaDepthEngine:
 
     def _complete(self, plans: list[SearchPlan]) -> Float32[Tensor, "k 3 gh gw"]:
         """The tracker's completed inverse depth, its prior weight and its relative precision."""
-        grids, typical = np.stack([p.grids for p in plans]), [p.typical for p in plans]
+        grids = np.stack([p.grids for p in plans])
+        typical = [p.typical for p in plans]
         if min(typical) > 0 and can_complete(grids.shape[2:], self.device):
             return complete(upload(grids, self.device), typical)
         completed = [complete_grid(g[0], g[1], g[2]) for g in grids]
@@ -176,21 +183,80 @@ class CudaDepthEngine:
     ) -> tuple[Tensor, Tensor]:
         """Depth and confidence of one keyframe."""
         reference, neighbours, _ = task
-        device, own = self.device, self._images_of(reference)
+        device = self.device
+        own = self._images_of(reference)
         tracker = TrackerMaps.of(grids, self._positions)
         if not neighbours:
             return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
         others = [self._images_of(v) for v in neighbours]
         across = packed(*homographies(reference, neighbours, self.render, self.render))
         finely = packed(*homographies(reference, neighbours, self.render, self.working))
-        swept = sweep(
-            own, torch.stack([o.grey for o in others]), upload(across, device),
-            PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight,
-        )  # fmt: skip
-        refined = refine(
-            own, torch.stack([o.fine for o in others]), upload(finely, device), self._positions,
-            *choose_start(tracker, swept), tracker,
-        )  # fmt: skip
+        grey = torch.stack([o.grey for o in others])
+        planes = PlaneSlots.of(plan.planes, device)
+        prior = (tracker.inverse_depth, tracker.prior_weight)
+        swept = sweep(own, grey, upload(across, device), planes, *prior)
+        fine = torch.stack([o.fine for o in others])
+        start = choose_start(tracker, swept)
+        refined = refine(own, fine, upload(finely, device), self._positions, *start, tracker)
         confidence = judge(refined, swept.margin, tracker, plan.near, plan.far)
         refined, confidence = resolve_edges(refined, confidence, own.colours, swept)
         return 1.0 / refined.inverse_depth, confidence
+
+
+def _window(minors: int) -> int:
+    """Rows of the band matrix worked on at a time, for lines of ``minors`` cells."""
+    return -(-2 * minors // _PANEL) * _PANEL + _PANEL
+
+
+def _shared_bytes(minors: int) -> int:
+    window = _window(minors)
+    return 8 * (window**2 + window * (_PANEL + 2) + _PANEL * (_PANEL + 1))
+
+
+def can_complete(shape: tuple[int, ...], device: torch.device) -> bool:
+    """Whether the band of a grid of this shape fits into the shared memory of the GPU."""
+    if _window(min(shape)) > 192:
+        return False
+    if device.type != "cuda":
+        return True
+    properties = torch.cuda.get_device_properties(device)
+    limit: int = getattr(properties, "shared_memory_per_block_optin", 48 * 1024)
+    return _shared_bytes(min(shape)) <= limit
+
+
+def complete(
+    grids: Float32[Tensor, "k 3 gh gw"], typical: Sequence[float]
+) -> Float32[Tensor, "k 3 gh gw"]:
+    """Completed inverse depth, ``prior_weight`` and ``relative_precision`` of some keyframes.
+
+    ``grids`` hold the tracker's inverse depth, its information and the weights of smoothness;
+    ``typical`` is the median of each keyframe's known inverse depths.
+    """
+    count, _, gh, gw = grids.shape
+    by_columns = gh <= gw
+    minors, majors = (gh, gw) if by_columns else (gw, gh)
+    strides = (gw, 1) if by_columns else (1, gw)
+    window = _window(minors)
+    padded = -(-gh * gw // _PANEL) * _PANEL
+    scratch = grids.new_empty(count * padded * (12 + window), dtype=torch.float64)
+    out = torch.empty_like(grids)
+    settings = upload(np.array(CompletionSettings(), np.float32), grids.device)
+    kernels_for(SOURCE, grids.device)["complete_grids"](
+        count, 32 * _PANEL, grids, upload(np.array(typical, np.float32), grids.device),
+        settings, minors, majors, *strides, padded, window - _PANEL, scratch, out,
+        shared=_shared_bytes(minors),
+    )  # fmt: skip
+    return out
+
+
+class CompletionSettings(NamedTuple):
+    """The struct of this name in ``completion.cu``."""
+
+    sigma_scale: float = grid_completion.DEVIATION_SCALE
+    bending: float = grid_completion.BENDING
+    membrane: float = grid_completion.MEMBRANE
+    sure_deviation: float = evidence.CONFIDENT_DEVIATION
+    tracker_scale: float = evidence.TRACKER_SCALE
+    unknown_deviation: float = evidence.UNKNOWN_DEVIATION
+    best_deviation: float = evidence.BEST_DEVIATION
+    kink: float = evidence.KINK

@@ -94,7 +94,8 @@ def average_support(
 ) -> Float32[Tensor, "h w s"]:
     """Costs averaged over pixels of like colour, and pulled to the prior inverse depth."""
     h, w = volume.shape[:2]
-    radius, out = plane_sweep.SUPPORT_RADIUS, torch.empty_like(volume)
+    radius = plane_sweep.SUPPORT_RADIUS
+    out = torch.empty_like(volume)
     kernels_for(MATCHING, volume.device)["average_support"](
         (-(-w // 8), -(-h // 4)), (32, 8, 4), volume, colours, planes.rho, prior, prior_weight,
         planes.per, h, w, radius, plane_sweep.SUPPORT_SHARPNESS, plane_sweep.PRIOR_PULL,
@@ -104,9 +105,7 @@ def average_support(
 
 
 def follow_paths(
-    volume: Float32[Tensor, "h w s"],
-    smooth: Float32[Tensor, "h w"],
-    planes: PlaneSlots,
+    volume: Float32[Tensor, "h w s"], smooth: Float32[Tensor, "h w"], planes: PlaneSlots
 ) -> Float32[Tensor, "8 h w s"]:
     """Semi-global path costs in each of the eight directions."""
     h, w = smooth.shape

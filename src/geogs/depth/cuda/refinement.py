@@ -1,4 +1,4 @@
-"""The refinement of ``refinement.py`` and the confidence on a GPU."""
+"""The refinement of ``refinement.py``, the confidence and the sides of edges on a GPU."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,16 @@ from geogs.depth import refinement as cpu
 from geogs.depth.confidence import WEIGHTS
 from geogs.depth.cuda.images import KeyframeImages
 from geogs.depth.cuda.plane_sweep import SweptDepth
+from geogs.depth.edges import (
+    CONTRAST,
+    COST_TRUST,
+    MEAN_SHIFTS,
+    MIN_GAP,
+    MOVED_CONFIDENCE,
+    PASSES,
+    WIDTH,
+    reach_of,
+)
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
@@ -19,6 +29,7 @@ from geogs.gpu.transfer import upload
 from geogs.world.grid import OFFSET, STRIDE
 
 SOURCE = Path(__file__).with_name("refinement.cu")
+EDGES = Path(__file__).with_name("edges.cu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +65,13 @@ class TrackerMaps:
     @staticmethod
     def of(grids: Float32[Tensor, "3 gh gw"], positions: PixelPositions) -> "TrackerMaps":
         """Bilinear values of the three grids at the render pixels."""
-        h, w = len(positions.grid_rows), len(positions.grid_columns)
+        columns = positions.grid_columns
+        rows = positions.grid_rows
+        h, w = len(rows), len(columns)
         out = grids.new_empty(3, h, w)
-        kernels_for(SOURCE, grids.device)["upsample_grids"](
-            (-(-w // 128), h, 3), 128, grids, positions.grid_columns, positions.grid_rows,
-            *grids.shape[1:], h, w, out,
-        )  # fmt: skip
+        blocks = (-(-w // 128), h, 3)
+        upsample = kernels_for(SOURCE, grids.device)["upsample_grids"]
+        upsample(blocks, 128, grids, columns, rows, *grids.shape[1:], h, w, out)
         return TrackerMaps(*out)
 
 
@@ -75,11 +87,13 @@ class SlantedMaps:
 
 def choose_start(tracker: TrackerMaps, swept: SweptDepth) -> tuple[Tensor, Tensor]:
     """As ``evidence.choose_start``."""
-    rho, confidence = torch.empty_like(swept.cost), torch.empty_like(swept.cost)
-    kernels_for(SOURCE, rho.device)["choose_start"](
-        -(-rho.numel() // 256), 256, tracker.inverse_depth, tracker.prior_weight,
-        swept.inverse_depth, swept.cost, swept.margin, rho.numel(), rho, confidence,
-    )  # fmt: skip
+    rho = torch.empty_like(swept.cost)
+    confidence = torch.empty_like(swept.cost)
+    count = rho.numel()
+    known = (tracker.inverse_depth, tracker.prior_weight)
+    matched = (swept.inverse_depth, swept.cost, swept.margin)
+    choose = kernels_for(SOURCE, rho.device)["choose_start"]
+    choose(-(-count // 256), 256, *known, *matched, count, rho, confidence)
     return rho, confidence
 
 
@@ -89,10 +103,10 @@ def gather_patches(
     """The fine reference image around every render pixel."""
     h, w = len(positions.grid_rows), len(positions.grid_columns)
     samples = fine.new_empty((2 * cpu.PATCH_REACH + 1) ** 2, h, w)
-    kernels_for(SOURCE, fine.device)["gather_patches"](
-        (-(-w // 128), h, len(samples)), 128, fine, positions.fine_columns, positions.fine_rows,
-        *fine.shape, h, w, samples,
-    )  # fmt: skip
+    blocks = (-(-w // 128), h, len(samples))
+    places = (positions.fine_columns, positions.fine_rows)
+    gather = kernels_for(SOURCE, fine.device)["gather_patches"]
+    gather(blocks, 128, fine, *places, *fine.shape, h, w, samples)
     return samples
 
 
@@ -157,14 +171,12 @@ def refine(
     for radius, tolerance in ((2, 0.05), (cpu.FIT_RADIUS, 0.03)):
         fit_planes(state, confidence, reference.colours, radius, tolerance, 0.0)
     state.inverse_depth = rho
+    fit = (cpu.FIT_RADIUS, cpu.FIT_TOLERANCE, cpu.FIT_STIFFNESS)
     for every in cpu.REFINE_STEPS:
         precision, confidence = photometric_step(
             state, samples, images, homographies, tracker, every
         )
-        fit_planes(
-            state, confidence, reference.colours, cpu.FIT_RADIUS, cpu.FIT_TOLERANCE,
-            cpu.FIT_STIFFNESS, precision,
-        )  # fmt: skip
+        fit_planes(state, confidence, reference.colours, *fit, precision)
     return state
 
 
@@ -177,7 +189,8 @@ def judge(
 ) -> Float32[Tensor, "h w"]:
     """Clamp inverse depth to 0.5 / ``far`` and 2 / ``near``; returns its confidence."""
     h, w = margin.shape
-    bounded, confidence = torch.empty_like(margin), torch.empty_like(margin)
+    bounded = torch.empty_like(margin)
+    confidence = torch.empty_like(margin)
     weights = upload(np.array(WEIGHTS, np.float32), margin.device)
     kernels_for(SOURCE, margin.device)["judge_depth"](
         (-(-w // 32), -(-h // 4)), (32, 4), refined.inverse_depth, margin, refined.support,
@@ -186,3 +199,26 @@ def judge(
     )  # fmt: skip
     refined.inverse_depth = bounded
     return confidence
+
+
+def resolve_edges(
+    refined: SlantedMaps,
+    confidence: Float32[Tensor, "h w"],
+    colours: Float32[Tensor, "3 h w"],
+    swept: SweptDepth,
+) -> tuple[SlantedMaps, Float32[Tensor, "h w"]]:
+    """As ``geogs.depth.edges.resolve_edges``; ``colours`` is the image in [0, 1]."""
+    h, w = confidence.shape
+    planes = swept.planes
+    constants = (CONTRAST, MIN_GAP, WIDTH, COST_TRUST, MOVED_CONFIDENCE)
+    settings = upload(np.array(constants, np.float32), confidence.device)
+    maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
+    for _ in range(PASSES):
+        out = [torch.empty_like(confidence) for _ in maps]
+        kernels_for(EDGES, confidence.device)["resolve_edges"](
+            (-(-w // 32), -(-h // 4)), (32, 4), *maps, colours, swept.costs, settings, planes.per,
+            planes.count, planes.first, planes.spacing, reach_of((h, w)), MEAN_SHIFTS, h, w, *out,
+        )  # fmt: skip
+        maps = out
+    rho, slope_x, slope_y, confidence = maps
+    return SlantedMaps(rho, slope_x, slope_y, refined.support), confidence

@@ -19,7 +19,8 @@ class Norm(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         b, c, h, w = x.shape
-        weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
+        weight = self.weight.to(x.dtype)
+        bias = self.bias.to(x.dtype)
         # Autocast would convert every normalised image to float32.
         return torch.native_group_norm(
             x.contiguous(), weight, bias, b, c, h * w, self.groups, 1e-5

@@ -106,13 +106,9 @@ def see_planes(
     cells = (pixels - (tried.cell - 1) / 2) / tried.cell
     x, y = cells.unbind(1)
     inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-    return PlaneViews(
-        cells.movedim(1, -1),
-        inside & (depth > LEAST_Z),
-        safe.log(),
-        cosine.clamp(-1 + 1e-6, 1 - 1e-6).arccos(),
-        (moved + 1e-3).log(),
-    )
+    seen = inside & (depth > LEAST_Z)
+    angle = cosine.clamp(-1 + 1e-6, 1 - 1e-6).arccos()
+    return PlaneViews(cells.movedim(1, -1), seen, safe.log(), angle, (moved + 1e-3).log())
 
 
 def sample_cells(

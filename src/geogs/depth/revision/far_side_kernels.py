@@ -48,14 +48,17 @@ def farther_planes(planes, farthest, ratio, reach, found):
                         continue
                     y, x = v + dy, u + dx
                     if round == 1:
-                        here, source = extended(planes, v, u, dy, dx, farthest, most), planes
+                        here = extended(planes, v, u, dy, dx, farthest, most)
+                        source = planes
                     else:
                         if y < 0 or x < 0 or y >= height or x >= width or age[y, x] != round - 1:
                             continue
-                        here, source = extended(found, v, u, dy, dx, farthest, most), found
+                        here = extended(found, v, u, dy, dx, farthest, most)
+                        source = found
                     if here > ZERO:
                         found[0, v, u] = here
-                        found[1, v, u], found[2, v, u] = source[1, y, x], source[2, y, x]
+                        found[1, v, u] = source[1, y, x]
+                        found[2, v, u] = source[2, y, x]
                         age[v, u] = round
                         any_new = True
                         break

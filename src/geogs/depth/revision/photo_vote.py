@@ -59,7 +59,8 @@ def photo_costs(
     poses = relative_poses(view, neighbours)[:, :3].astype(np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     first, second = np.ascontiguousarray(depths.numpy(), np.float32)
-    differences, costs = np.empty_like(images), np.empty(depths.shape, np.float32)
+    differences = np.empty_like(images)
+    costs = np.empty(depths.shape, np.float32)
     kernels.grey_differences(view.grey, images, poses, lens, first, differences)
     offset, limit = _offset_and_limit(differences, same.numpy())
     kernels.pixel_costs(differences, offset, limit, near, costs[0])
@@ -75,7 +76,7 @@ def photo_costs(
 def _offset_and_limit(
     differences: Float32[np.ndarray, "n h w"], same: Bool[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """As ``offset_and_limit`` of ``cuda/photo_vote.py``."""
+    """As ``offset_and_limit`` of ``cuda/revision.py``."""
     offset, limit = np.zeros((2, len(differences)), np.float32)
     for n, known in enumerate(differences[:, same]):
         known = known[~np.isnan(known)]

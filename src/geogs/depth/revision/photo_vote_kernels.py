@@ -26,9 +26,12 @@ def project_row(T, lens, y, depth, place):
     t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     ry = (np.float32(y) - cy) / fy
-    row, u, v = depth[y], place[0], place[1]
+    row = depth[y]
+    u = place[0]
+    v = place[1]
     for x in range(row.shape[0]):
-        z0, rx = row[x], (np.float32(np.int32(x)) - cx) / fx
+        z0 = row[x]
+        rx = (np.float32(np.int32(x)) - cx) / fx
         px, py = z0 * rx, z0 * ry
         z = t20 * px + t21 * py + t22 * z0 + t23
         inverse = ONE / max(z, np.float32(1e-9)) if z > ZERO else np.float32(np.nan)
@@ -47,7 +50,8 @@ def grey_at(image, u, v):
     a, b = u - np.float32(i), v - np.float32(j)
     p, q = image[np.uint32(j)], image[np.uint32(j + 1)]
     left, right = np.uint32(i), np.uint32(i + 1)
-    upper, lower = p[left] + a * (p[right] - p[left]), q[left] + a * (q[right] - q[left])
+    upper = p[left] + a * (p[right] - p[left])
+    lower = q[left] + a * (q[right] - q[left])
     return upper + b * (lower - upper)
 
 
@@ -72,12 +76,14 @@ def better_half(costs, count):
     if count == 0:
         return ONE
     for i in range(1, count):
-        value, k = costs[i], i
+        value = costs[i]
+        k = i
         while k > 0 and costs[k - 1] > value:
             costs[k] = costs[k - 1]
             k -= 1
         costs[k] = value
-    half, total = (count + 1) // 2, ZERO
+    half = (count + 1) // 2
+    total = ZERO
     for i in range(half):
         total += costs[i]
     return total / np.float32(half)
@@ -112,10 +118,13 @@ def average_costs(costs, mask, guide, radius, contrast, mean):
     fall = -ONE / (np.float32(3) * contrast)
     for y in range(height):
         for x in range(width):
-            mean[0, y, x], mean[1, y, x] = ZERO, ZERO
+            mean[0, y, x] = ZERO
+            mean[1, y, x] = ZERO
             if not mask[y, x]:
                 continue
-            first, second, weights = ZERO, ZERO, ZERO
+            first = ZERO
+            second = ZERO
+            weights = ZERO
             for dy in range(-radius, radius + 1):
                 v = min(max(y + dy, 0), height - 1)
                 for dx in range(-radius, radius + 1):
@@ -127,4 +136,5 @@ def average_costs(costs, mask, guide, radius, contrast, mean):
                     first += weight * costs[0, v, u]
                     second += weight * costs[1, v, u]
                     weights += weight
-            mean[0, y, x], mean[1, y, x] = first / weights, second / weights
+            mean[0, y, x] = first / weights
+            mean[1, y, x] = second / weights

@@ -19,17 +19,24 @@ _PART = inlined(_EXACT)
 
 
 class PlaneRules(NamedTuple):
-    """Limits of the search for planes, as :mod:`geogs.depth.revision.segment_planes` has them."""
+    """Limits of the search for planes."""
 
     reach: int
     """Pixels around a segment, or a part of it, that are its rim."""
-    tolerance: float
-    min_explained: float
-    min_on_plane: float
-    correlated: int
-    min_pixels: int
-    max_pixels: int
-    refits: int
+    tolerance: float = 0.02
+    """Relative distance in inverse depth from a plane within which a pixel lies on it."""
+    min_explained: float = 0.35
+    """Least fraction of the confident pixels, by confidence, that each plane explains."""
+    min_on_plane: float = 0.6
+    """Least fraction of the confident pixels at the rim of an uncertain part that lie on planes."""
+    correlated: int = 25
+    """Neighbouring pixels whose errors count as one for the deviation."""
+    min_pixels: int = 40
+    """Least pixels of a fit."""
+    max_pixels: int = 750
+    """Most pixels of a fit."""
+    refits: int = 4
+    """Fits of the inliers."""
 
 
 @njit(**_EXACT)
@@ -37,12 +44,15 @@ def segment_boxes(labels, uncertain, sky, boxes, counts):
     """Boxes (n, 4) of the segments from 1 on, and counts (n, 3) of all their pixels, of those that
     are ``uncertain`` and of those of the ``sky``."""
     height, width = labels.shape
-    boxes[:, 0], boxes[:, 1] = height, width
-    boxes[:, 2:], counts[:] = 0, 0
+    boxes[:, 0] = height
+    boxes[:, 1] = width
+    boxes[:, 2:] = 0
+    counts[:] = 0
     for v in range(height):
         for u in range(width):
             if labels[v, u] > 0:
-                box, count = boxes[labels[v, u] - 1], counts[labels[v, u] - 1]
+                box = boxes[labels[v, u] - 1]
+                count = counts[labels[v, u] - 1]
                 box[0], box[1] = min(box[0], v), min(box[1], u)
                 box[2], box[3] = max(box[2], v + 1), max(box[3], u + 1)
                 count[0] += 1
@@ -54,9 +64,11 @@ def segment_boxes(labels, uncertain, sky, boxes, counts):
 def widened(box, reach, shape):
     """A box widened by ``reach`` on all sides, within an image."""
     return (
-        max(0, box[0] - reach), max(0, box[1] - reach),
-        min(shape[0], box[2] + reach), min(shape[1], box[3] + reach),
-    )  # fmt: skip
+        max(0, box[0] - reach),
+        max(0, box[1] - reach),
+        min(shape[0], box[2] + reach),
+        min(shape[1], box[3] + reach),
+    )
 
 
 @njit(**_EXACT)
@@ -65,7 +77,8 @@ def near_part(parts, number, box, reach):
     lies in the box."""
     top, left, low, right = box
     height, width = low - top, right - left
-    across, near = np.empty((height, width), np.uint8), np.empty((height, width), np.uint8)
+    across = np.empty((height, width), np.uint8)
+    near = np.empty((height, width), np.uint8)
     for v in range(height):
         since = reach + 1
         for u in range(width):
@@ -91,7 +104,8 @@ def rim_pixels(labels, label, box, reach, confident):
     whole = box[0], box[1], box[2], box[3]
     top, left, low, right = wide = widened(whole, reach, labels.shape)
     near = near_part(labels, label, wide, reach)
-    pixels, count = np.empty(near.size, np.int64), 0
+    pixels = np.empty(near.size, np.int64)
+    count = 0
     for v in range(top, low):
         for u in range(left, right):
             pixels[count] = v * labels.shape[1] + u
@@ -111,17 +125,26 @@ def connected(labels, label, uncertain, v0, u0, parts, number, pixels):
     """Write a ``number`` into ``parts`` at the 8-connected ``uncertain`` pixels of a segment around
     one of them, and their flat indices into ``pixels``; returns their box and how many they are."""
     height, width = labels.shape
-    parts[v0, u0], pixels[0] = number, v0 * width + u0
-    done, found = 0, 1
-    top, left, low, right = v0, u0, v0, u0
+    parts[v0, u0] = number
+    pixels[0] = v0 * width + u0
+    done = 0
+    found = 1
+    top = v0
+    left = u0
+    low = v0
+    right = u0
     while done < found:
         v, u = pixels[done] // width, pixels[done] % width
         done += 1
-        top, left, low, right = min(top, v), min(left, u), max(low, v), max(right, u)
+        top = min(top, v)
+        left = min(left, u)
+        low = max(low, v)
+        right = max(right, u)
         for y in range(max(v - 1, 0), min(v + 2, height)):
             for x in range(max(u - 1, 0), min(u + 2, width)):
                 if parts[y, x] == 0 and labels[y, x] == label and uncertain[y, x]:
-                    parts[y, x], pixels[found] = number, y * width + x
+                    parts[y, x] = number
+                    pixels[found] = y * width + x
                     found += 1
     return (top, left, low + 1, right + 1), found
 
@@ -134,7 +157,8 @@ def mark_supported(labels, label, box, uncertain, confident, depth, planes, rule
 
     ``parts``, which is 0 in the segment on entry, receives a number of its own for each part.
     """
-    pixels, shape = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32), labels.shape
+    pixels = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32)
+    shape = labels.shape
     for v0 in range(box[0], box[2]):
         for u0 in range(box[1], box[3]):
             if parts[v0, u0] != 0 or labels[v0, u0] != label or not uncertain[v0, u0]:
@@ -145,12 +169,14 @@ def mark_supported(labels, label, box, uncertain, confident, depth, planes, rule
                 continue
             wide = widened(own, rules.reach, shape)
             near = near_part(parts, number, wide, rules.reach)
-            around, on = 0, 0
+            around = 0
+            on = 0
             for v in range(wide[0], wide[2]):
                 for u in range(wide[1], wide[3]):
                     if near[v - wide[0], u - wide[1]] and confident[v, u]:
                         around += 1
-                        value, is_on = 1 / np.float64(depth[v, u]), False
+                        value = 1 / np.float64(depth[v, u])
+                        is_on = False
                         for p in range(len(planes)):
                             off = abs(at_pixel(planes[p], v, u, shape)[0] - value)
                             is_on |= off < rules.tolerance * value
@@ -163,7 +189,7 @@ def mark_supported(labels, label, box, uncertain, confident, depth, planes, rule
 @njit(**_EXACT)
 def planes_of_segment(
     labels, label, box, uncertain, confident, depth, confidence, draws, rules, parts, marked
-):  # fmt: skip
+):
     """Planes (p, 3) of a segment, their covariances, and how many were tried; also flat indices of
     some confident pixels at the segment and its rim, and the number, from 1 on, of their planes.
 
@@ -177,8 +203,10 @@ def planes_of_segment(
     weight = np.empty(len(some))
     for i in range(len(some)):
         v, u = some[i] // labels.shape[1], some[i] % labels.shape[1]
-        x[i], y[i] = (u + 0.5) / labels.shape[1] - 0.5, (v + 0.5) / labels.shape[0] - 0.5
-        value[i], weight[i] = 1 / np.float64(depth[v, u]), confidence[v, u]
+        x[i] = (u + 0.5) / labels.shape[1] - 0.5
+        y[i] = (v + 0.5) / labels.shape[0] - 0.5
+        value[i] = 1 / np.float64(depth[v, u])
+        weight[i] = confidence[v, u]
     planes, covariances, of, tried = segment_planes(x, y, value, weight, draws, rules)
     if len(planes):
         mark_supported(
@@ -207,7 +235,8 @@ def mark_stable(marked, label, nearest, box, planes, covariances, most, first, w
 def planar_pixels(which, planes, depth, confidence, uncertain, farthest, pixels, found):
     """Flat indices, and z on their planes, of pixels whose confidence is at most ``uncertain`` and
     whose plane is not ``farthest`` times nearer or farther than their depth; returns how many."""
-    count, shape = 0, which.shape
+    count = 0
+    shape = which.shape
     for v in range(shape[0]):
         for u in range(shape[1]):
             if which[v, u] == 0 or not confidence[v, u] <= uncertain:
@@ -215,7 +244,8 @@ def planar_pixels(which, planes, depth, confidence, uncertain, farthest, pixels,
             value = at_pixel(planes[which[v, u] - 1], v, u, shape)[0]
             own = 1 / depth[v, u]
             if value > own / farthest and value < farthest * own:
-                pixels[count], found[count] = v * shape[1] + u, 1 / value
+                pixels[count] = v * shape[1] + u
+                found[count] = 1 / value
                 count += 1
     return count
 
@@ -224,9 +254,15 @@ def planar_pixels(which, planes, depth, confidence, uncertain, farthest, pixels,
 def solved(sums, damping, x, y, z):
     """Solution of the damped symmetric 3 x 3 system, six numbers of the matrix, for x, y and z."""
     a, b, c, d, e, f = sums
-    a, d, f = a + damping, d + damping, f + damping
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    a = a + damping
+    d = d + damping
+    f = f + damping
+    A = d * f - e * e
+    B = c * e - b * f
+    C = b * e - c * d
+    D = a * f - c * c
+    E = b * c - a * e
+    F = a * d - b * b
     inverse = 1 / (a * A + b * B + c * C)
     return (
         (A * x + B * y + C * z) * inverse,
@@ -274,20 +310,26 @@ def best_sample(x, y, value, weight, uniform, tolerance):
 
     ``uniform`` (t, 3) draws the pixels in proportion to their weight.
     """
-    whole, reached = summed(weight), 0.0
+    whole = summed(weight)
+    reached = 0.0
     chance = np.empty(len(weight))
     for n in range(len(weight)):
         reached += weight[n] / whole
         chance[n] = reached
     for n in range(len(weight)):
         chance[n] /= reached
-    best, most = (0.0, 0.0, 0.0), -1.0
+    best = (0.0, 0.0, 0.0)
+    most = -1.0
     for t in range(len(uniform)):
         i = drawn(chance, uniform[t, 0])
         j = drawn(chance, uniform[t, 1])
         k = drawn(chance, uniform[t, 2])
-        x1, y1, v1 = x[j] - x[i], y[j] - y[i], value[j] - value[i]
-        x2, y2, v2 = x[k] - x[i], y[k] - y[i], value[k] - value[i]
+        x1 = x[j] - x[i]
+        y1 = y[j] - y[i]
+        v1 = value[j] - value[i]
+        x2 = x[k] - x[i]
+        y2 = y[k] - y[i]
+        v2 = value[k] - value[i]
         area = x1 * y2 - x2 * y1
         if abs(area) <= 1e-9:
             continue
@@ -295,7 +337,8 @@ def best_sample(x, y, value, weight, uniform, tolerance):
         c = value[i] - a * x[i] - b * y[i]
         on = explained(x, y, value, weight, tolerance, a, b, c)
         if on > most:
-            best, most = (a, b, c), on
+            best = (a, b, c)
+            most = on
     return best, most
 
 
@@ -315,32 +358,30 @@ def fit_plane(x, y, value, weight, uniform, rules):
     it, the inliers, and their weighted sums of xx, xy, x, yy, y and 1. Too few count as none.
     """
     (a, b, c), most = best_sample(x, y, value, weight, uniform, rules.tolerance)
-    on, sums = np.empty(len(value), np.bool_), np.zeros(6)
+    on = np.empty(len(value), np.bool_)
+    sums = np.zeros(6)
     count = mark_inliers(x, y, value, rules.tolerance, a, b, c, on)
     for _ in range(rules.refits):
         if most < 0 or count < rules.min_pixels:
             on[:] = False
             break
         sums[:] = 0.0
-        xv, yv, v = 0.0, 0.0, 0.0
+        xv = 0.0
+        yv = 0.0
+        v = 0.0
         for i in range(len(value)):
             if on[i]:
-                wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
+                wx = weight[i] * x[i]
+                wy = weight[i] * y[i]
+                w = weight[i]
                 sums[0], sums[1], sums[2] = sums[0] + wx * x[i], sums[1] + wx * y[i], sums[2] + wx
                 sums[3], sums[4], sums[5] = sums[3] + wy * y[i], sums[4] + wy, sums[5] + w
-                xv, yv, v = xv + wx * value[i], yv + wy * value[i], v + w * value[i]
+                xv = xv + wx * value[i]
+                yv = yv + wy * value[i]
+                v = v + w * value[i]
         a, b, c = solved(sums, 1e-12, xv, yv, v)
         count = mark_inliers(x, y, value, rules.tolerance, a, b, c, on)
     return (a, b, c), on, sums
-
-
-@njit(**_PART)
-def picked(values, of):
-    """The values of some pixels."""
-    found = np.empty(len(of))
-    for i in range(len(of)):
-        found[i] = values[of[i]]
-    return found
 
 
 @njit(**_PART)
@@ -351,16 +392,21 @@ def segment_planes(x, y, value, weight, draws, rules):
     ``draws`` (n, t, 3) are the random numbers of at most n planes. Inliers are assumed to deviate
     by half the tolerance, and one in ``correlated`` of them to be independent.
     """
-    planes, covariances = np.empty((len(draws), 3)), np.empty((len(draws), 3, 3))
-    of, left, found, tried = np.zeros(len(x), np.int32), np.arange(len(x)), 0, 0
+    planes = np.empty((len(draws), 3))
+    covariances = np.empty((len(draws), 3, 3))
+    of = np.zeros(len(x), np.int32)
+    left = np.arange(len(x))
+    found = 0
+    tried = 0
     whole = summed(weight)
     while tried < len(draws) and len(left) >= rules.min_pixels:
         plane, on, sums = fit_plane(
-            picked(x, left), picked(y, left), picked(value, left), picked(weight, left),
-            draws[tried], rules,
-        )  # fmt: skip
+            x[left], y[left], value[left], weight[left], draws[tried], rules
+        )
         tried += 1
-        count, own, values = 0, 0.0, 0.0
+        count = 0
+        own = 0.0
+        values = 0.0
         for i in range(len(left)):
             if on[i]:
                 own += weight[left[i]]
@@ -371,7 +417,9 @@ def segment_planes(x, y, value, weight, draws, rules):
         variance = rules.correlated * (rules.tolerance / 2 * (values / count)) ** 2
         planes[found, 0], planes[found, 1], planes[found, 2] = plane
         for k in range(3):
-            x1, y1, one = variance * (k == 0), variance * (k == 1), variance * (k == 2)
+            x1 = variance * (k == 0)
+            y1 = variance * (k == 1)
+            one = variance * (k == 2)
             row = solved(sums, 1e-9, x1, y1, one)
             covariances[found, k, 0], covariances[found, k, 1], covariances[found, k, 2] = row
         found += 1

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int, Int32
+from jaxtyping import Bool, Float32, Float64, Int, Int32, UInt8
 
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
@@ -20,25 +20,47 @@ RIM_WIDTH = 0.0125
 """Width of the rim around a segment, in long edges of the image."""
 CONFIDENT, UNCERTAIN = 0.7, 0.5
 """Confidence above which a depth supports a plane, and up to which the plane's replaces it."""
-TOLERANCE = 0.02
-"""Relative distance in inverse depth from a plane within which a pixel lies on it."""
-MOST_PLANES, MIN_EXPLAINED = 3, 0.35
-"""Most planes of a segment, as of a wall around a corner, and the least fraction of the confident
-pixels, by confidence, that each explains."""
-MIN_ON_PLANE = 0.6
-"""Least fraction of the confident pixels at the rim of an uncertain part that lie on a plane."""
+MOST_PLANES = 3
+"""Most planes of a segment, as of a wall around a corner."""
 MAX_DEVIATION = 0.01
 """Largest relative standard deviation of a plane's inverse depth at a pixel that takes it."""
-CORRELATED = 25
-"""Neighbouring pixels whose errors count as one for the deviation."""
 CONFIDENCE = 0.5
 """Confidence of a depth on a segment's plane, about as measured."""
 MAX_SKY = 0.2
 """Fraction of sky above which a segment has no planes."""
 MAX_DEPTH_RATIO = 5.0
 """Largest ratio, either way, of the searched depth to that of a plane."""
-_MIN_PIXELS, _MAX_PIXELS, _SAMPLES, _REFITS = 40, 750, 64, 4
-"""Least and most pixels of a fit, samples of three that are tried, and fits of the inliers."""
+_SAMPLES = 64
+"""Samples of three pixels that are tried for a plane."""
+EDGE = 320
+"""Longest edge of the image that is searched, pixels."""
+SMOOTHING = 1.2
+"""Standard deviation of the blur that removes noise, pixels of that image."""
+MAX_GRADIENT = 2.0
+"""Largest gradient, grey levels a pixel, of any channel in a bare part."""
+MIN_AREA = 0.003
+"""Least area of a segment, as a fraction of the image."""
+
+
+def bare_segments(image: UInt8[np.ndarray, "ih iw 3"]) -> Int32[np.ndarray, "h w"]:
+    """Labels from 1 on of the connected bare parts of an image, 0 elsewhere, at its size or that of
+    ``EDGE``, whichever is smaller."""
+    height, width = image.shape[:2]
+    factor = min(1.0, EDGE / max(height, width))
+    size = max(3, round(width * factor)), max(3, round(height * factor))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small.astype(np.float32), (0, 0), SMOOTHING)
+    change = np.zeros(smooth.shape[:2], np.float32)
+    for channel in cv2.split(smooth):
+        across = cv2.absdiff(channel[:, 2:], channel[:, :-2])
+        down = cv2.absdiff(channel[2:], channel[:-2])
+        change[:, 1:-1] = np.maximum(change[:, 1:-1], across)
+        change[1:-1] = np.maximum(change[1:-1], down)
+    is_bare = (change < 2 * MAX_GRADIENT).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(is_bare, connectivity=4)
+    is_large = stats[:, cv2.CC_STAT_AREA] > MIN_AREA * labels.size
+    is_large[0] = False
+    return (np.cumsum(is_large) * is_large).astype(np.int32)[labels]
 
 
 def planar_depth(
@@ -58,7 +80,9 @@ def planar_depth(
     if not len(planar.pixels):
         return found
     pixels = torch.from_numpy(planar.pixels).to(device)
-    depth, confidence, normal = found.depth.clone(), found.confidence.clone(), found.normal
+    depth = found.depth.clone()
+    confidence = found.confidence.clone()
+    normal = found.normal
     depth.view(-1)[pixels] = torch.from_numpy(planar.depth).to(device)
     confidence.view(-1)[pixels] = CONFIDENCE
     if normal is not None:
@@ -105,7 +129,8 @@ def on_planes(
 
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
     which = _resized(which, found.depth.shape)
-    pixels, depth = np.empty(which.size, np.int64), np.empty(which.size, np.float32)
+    pixels = np.empty(which.size, np.int64)
+    depth = np.empty(which.size, np.float32)
     count = planar_pixels(
         which, planes, found.depth, found.confidence, UNCERTAIN, MAX_DEPTH_RATIO, pixels, depth
     )
@@ -129,18 +154,17 @@ def _planes_of_segments(
     shape = labels.shape
     depth, confidence = (_resized(m, shape) for m in (found.depth, found.confidence))
     is_sky = np.zeros(shape, bool) if sky is None else _resized(sky.view(np.uint8), shape) > 0
-    uncertain, confident = confidence <= UNCERTAIN, confidence > CONFIDENT
+    uncertain = confidence <= UNCERTAIN
+    confident = confidence > CONFIDENT
     boxes, counts = (np.empty((int(labels.max(initial=0)), k), np.int64) for k in (4, 3))
     kernels.segment_boxes(labels, uncertain, is_sky, boxes, counts)
     total, doubtful, of_sky = counts.T
-    worth_it = np.flatnonzero((doubtful >= _MIN_PIXELS) & (of_sky <= MAX_SKY * total))
+    rules = kernels.PlaneRules(max(1, round(RIM_WIDTH * max(shape))))
+    worth_it = np.flatnonzero((doubtful >= rules.min_pixels) & (of_sky <= MAX_SKY * total))
     draws = rng.random((MOST_PLANES * len(worth_it), _SAMPLES, 3))
-    rules = kernels.PlaneRules(
-        max(1, round(RIM_WIDTH * max(shape))), TOLERANCE, MIN_EXPLAINED, MIN_ON_PLANE, CORRELATED,
-        _MIN_PIXELS, _MAX_PIXELS, _REFITS,
-    )  # fmt: skip
     which, parts, marked, alone = np.zeros((4, *shape), np.int32)
-    planes, drawn = [np.empty((0, 3))], 0
+    planes = [np.empty((0, 3))]
+    drawn = 0
     for label, box in zip(worth_it + 1, boxes[worth_it], strict=True):
         own, covariances, tried, known, of = kernels.planes_of_segment(
             labels, label, box, uncertain, confident, depth, confidence,

@@ -15,7 +15,6 @@ DEEP = (0.08, 0.08, 0.04)
 """Depth of objects at a wall, or ceiling, that are hidden with it, relative to the extent."""
 _GROUND = 0.06
 """Fraction of the height that is always shown: the floor."""
-_KEPT = 0.005
 
 
 @dataclass(frozen=True)
@@ -40,13 +39,15 @@ def find_room(
 
     A wall is area that faces inwards, lies beyond most of the cameras, and has little beyond it.
     """
-    local, normals = surface.centres @ axes.T, surface.normals @ axes.T
+    local = surface.centres @ axes.T
+    normals = surface.normals @ axes.T
     cameras = np.median(T_wc[:, :3, 3] @ axes.T, axis=0)
-    low, high = np.quantile(local, [_KEPT, 1 - _KEPT], axis=0)
+    low, high = np.quantile(local, [0.005, 0.995], axis=0)
     extent = high - low
     bounds = np.full((2, 3), np.inf)
     for axis, sign in ((0, 1), (1, 1), (2, 1), (0, -1), (1, -1)):
-        along, facing = sign * local[:, axis], sign * normals[:, axis]
+        along = sign * local[:, axis]
+        facing = sign * normals[:, axis]
         place = _wall(along, facing, surface.areas, sign * cameras[axis], extent[axis])
         if place is not None:
             bounds[(1 - sign) // 2, axis] = place - DEEP[axis] * extent[axis]

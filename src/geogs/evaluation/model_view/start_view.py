@@ -17,8 +17,6 @@ ELEVATION = 40.0
 _TURNS = 24
 """Number of tested azimuths."""
 _MARGIN = 1.05
-_KEPT = 0.005
-"""Fraction of the points on each side that may be cut off."""
 
 
 class StartView(NamedTuple):
@@ -44,7 +42,7 @@ def start_view(
         surface: surface for the choice of the side; without it, the view is along the cameras'.
     """
     local = points.astype(np.float64) @ axes.T
-    low, high = np.quantile(local, [_KEPT, 1 - _KEPT], axis=0)
+    low, high = np.quantile(local, [0.005, 0.995], axis=0)
     is_near = ((local >= low) & (local <= high)).all(1)
     local = np.concatenate([local[is_near], T_wc[:, :3, 3] @ axes.T])
     middle = (local.min(0) + local.max(0)) / 2

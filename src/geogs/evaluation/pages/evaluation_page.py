@@ -169,14 +169,18 @@ def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str
     how = {"sim3": "Sim(3)", "se3": "SE(3)", "none": "not"}[errors.alignment]
     return [
         (f"ATE RMSE, {name}, {how} aligned (cm)", f"{errors.ate_rmse_cm:.3f}"),
-        ("  mean / median / max (cm)", f"{errors.ate_mean_cm:.3f} / {errors.ate_median_cm:.3f} / "
-         f"{errors.ate_max_cm:.3f}"),
+        (
+            "  mean / median / max (cm)",
+            f"{errors.ate_mean_cm:.3f} / {errors.ate_median_cm:.3f} / {errors.ate_max_cm:.3f}",
+        ),
         _rotation_row(errors),
         ("  scale (m per map unit)", f"{errors.scale:.5f}"),
-        ("  poses compared / estimated / true", f"{errors.pairs} / {errors.estimated} / "
-         f"{errors.reference}"),
+        (
+            "  poses compared / estimated / true",
+            f"{errors.pairs} / {errors.estimated} / {errors.reference}",
+        ),
         ("  path length (m)", f"{errors.path_length_m:.2f}"),
-    ]  # fmt: skip
+    ]
 
 
 def _rotation_row(errors: TrajectoryErrors) -> tuple[str, str]:

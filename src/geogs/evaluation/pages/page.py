@@ -67,11 +67,7 @@ Section = TableSection | PictureSection | TextSection | FiguresSection | HtmlSec
 
 
 def write_page(
-    path: Path,
-    title: str,
-    sections: Sequence[Section],
-    subtitle: str = "",
-    is_whole: bool = False,
+    path: Path, title: str, sections: Sequence[Section], subtitle: str = "", is_whole: bool = False
 ) -> None:
     """Write a page for any browser, from the disk: also on a phone, and in dark mode.
 

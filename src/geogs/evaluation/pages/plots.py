@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.evaluation.held_camera import level_axes
-from geogs.evaluation.pages.shading import Viewpoint, look
+from geogs.evaluation.pages.shading import GREY, Viewpoint, look
 from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
@@ -24,7 +24,6 @@ _TRUTH, _ESTIMATE = "0.45", "#0072b2"
 _ERROR_MAP = "YlOrRd"
 ERROR_STOPS = ("#ffffcc", "#fed976", "#fd8d3c", "#e2191c", "#800026")
 """CSS colours of :func:`error_colours` from zero to the largest error."""
-_UNKNOWN = 190
 
 
 def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
@@ -39,7 +38,9 @@ def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
     for column, (name, upwards, vertical) in enumerate(sides):
         plot = figure.add_subplot(1, 2, column + 1)
         plot.plot(truth[:, 0], truth[:, vertical], color=_TRUTH, lw=2.5, label="truth")
-        x, y, colour = estimate[:, 0], estimate[:, vertical], 100 * errors.position_error
+        x = estimate[:, 0]
+        y = estimate[:, vertical]
+        colour = 100 * errors.position_error
         dots = plot.scatter(x, y, 7, colour, cmap="plasma", label="estimate", zorder=3)
         plot.set_aspect("equal", adjustable="datalim")
         plot.set(title=name, xlabel="right (m)", ylabel=f"{upwards} (m)")
@@ -101,7 +102,8 @@ def plot_beside_truth(path: Path, compared: SurfaceComparison, views: Sequence[V
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    mesh, truth = compared.mesh, compared.truth
+    mesh = compared.mesh
+    truth = compared.truth
     sights = thread_map(partial(look, mesh.vertices, mesh.faces), views)
     rows = [("reconstruction", [sight.paint() for sight in sights])]
     if truth is not None and truth.is_mesh:
@@ -146,7 +148,7 @@ def error_colours(
     errors = 100 * compared.distance
     fraction = (errors[nearest].mean(1) / compared.scores.colour_limit_cm).clip(0, 1)
     colours = (255 * colormaps[_ERROR_MAP](fraction)[:, :3]).round().astype(np.uint8)
-    return np.where(distance[:, :1] <= compared.reach, colours, np.uint8(_UNKNOWN))
+    return np.where(distance[:, :1] <= compared.reach, colours, np.uint8(GREY))
 
 
 def new_figure(width: float, height: float) -> "Figure":

@@ -7,7 +7,7 @@ from typing import Any
 from geogs.documents import UNUSABLE
 from geogs.evaluation.duration import duration
 from geogs.evaluation.model_view.model_section import model_section
-from geogs.evaluation.model_view.shown_model import ShownModel
+from geogs.evaluation.model_view.shown_model import Lengths, ShownModel
 from geogs.evaluation.pages.page import (
     FiguresSection,
     HtmlSection,
@@ -17,12 +17,12 @@ from geogs.evaluation.pages.page import (
     write_page,
 )
 
-PICTURES = {
-    "keyframes.png": "Rendered keyframes",
-    "trajectory.png": "Trajectory",
-}
+PICTURES = {"keyframes.png": "Rendered keyframes", "trajectory.png": "Trajectory"}
 """Titles of the pictures that a run leaves in ``report/``, in the order of the page."""
 
+
+METRES = {"metres": 1.0, "millimetres": 0.001}
+"""Metres per unit of poses, by the name of the unit."""
 
 Show = Callable[[Any], str]
 
@@ -64,7 +64,8 @@ def figures(summary: Mapping[str, Any], numbers: list[tuple[str, str]]) -> Figur
 
 def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The main numbers of a run."""
-    seconds, rates = summary.get("seconds"), summary.get("frames_per_second")
+    seconds = summary.get("seconds")
+    rates = summary.get("frames_per_second")
     total = seconds.get("total") if isinstance(seconds, Mapping) else None
     rate = rates.get("with_final_stages") if isinstance(rates, Mapping) else None
     shown: list[tuple[str, Show, object]] = [
@@ -152,3 +153,27 @@ _RUN_ROWS = (
     ("stopped early", "interrupted", _yes),
     ("seed", "seed", str),
 )
+
+
+def lengths(summary: Mapping[str, Any]) -> Lengths:
+    """Metres where ``scale`` in ``summary.json`` is metric, else units of the sequence."""
+    scale = summary.get("scale")
+    said = scale if isinstance(scale, str) else ""
+    kind, _, rest = said.partition(" (")
+    origin = rest.removesuffix(")")
+    if kind == "metric":
+        return Lengths(1.0, f"Metres by {origin}{_uncertain(summary.get('metric_scale'))}.")
+    if kind == "of the poses":
+        metres = METRES.get(origin)
+        what = "Metres by the poses that were given" if metres else "Units of the poses given"
+        return Lengths(metres, f"{what}.")
+    note = "The images alone do not tell metres: lengths are in units of this sequence."
+    return Lengths(None, note)
+
+
+def _uncertain(metric: object) -> str:
+    """Relative uncertainty of the scale, two standard deviations."""
+    deviation = metric.get("deviation") if isinstance(metric, Mapping) else None
+    if not isinstance(deviation, int | float) or not 0 < deviation < 1:
+        return ""
+    return f", to about {200 * deviation:.2g} %"

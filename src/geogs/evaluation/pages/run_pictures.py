@@ -91,15 +91,13 @@ def draw_keyframes(
     Depth is white where it is 0 or not finite; normals (camera frame) show x, y, z as red, green,
     blue, from -1 dark to 1 bright; surfaces that face the camera are bright blue.
     """
-    known = [d[np.isfinite(d) & (d > 0)] for d in depths]
-    values = np.concatenate(known) if known else np.zeros(0)
-    low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
+    low, high = _depth_range(depths)
     height = max(round(_CELL * images[0].shape[0] / images[0].shape[1]), 1)
     rows = len(images)
     width = 3 * _CELL + 2 * _GAP
     picture = np.full((_HEAD + rows * (height + _GAP), width + _BAR, 3), 255, np.uint8)
     for row, (image, depth, normal) in enumerate(zip(images, depths, normals, strict=True)):
-        shown = (image, depth_colours(depth, float(low), float(high)), normal_colours(normal))
+        shown = (image, depth_colours(depth, low, high), normal_colours(normal))
         top = _HEAD + row * (height + _GAP)
         for column, cell in enumerate(shown):
             left = column * (_CELL + _GAP)
@@ -109,8 +107,17 @@ def draw_keyframes(
             picture[top : top + height, left : left + _CELL] = fitted
     for column, title in enumerate(("image", "depth", "normals")):
         _write(picture, title, (column * (_CELL + _GAP) + 4, 19), 0.5)
-    _depth_bar(picture[:, width + 10 :], float(low), float(high))
+    _depth_bar(picture[:, width + 10 :], low, high)
     save_picture(path, picture)
+
+
+def _depth_range(depths: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, float]:
+    """1st and 99th percentile of the known depths; 0 and 1 where there is none."""
+    known = np.concatenate(
+        [np.zeros(0, np.float32), *(d[np.isfinite(d) & (d > 0)] for d in depths)]
+    )
+    low, high = np.quantile(known, [0.01, 0.99]) if len(known) else (0.0, 1.0)
+    return float(low), float(high)
 
 
 def depth_colours(
@@ -146,9 +153,7 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
             return keyframe.image
         case "depth":
             depth = keyframe.depth.cpu().numpy()
-            known = depth[np.isfinite(depth) & (depth > 0)]
-            low, high = np.quantile(known, [0.01, 0.99]) if len(known) else (0.0, 1.0)
-            return depth_colours(depth, float(low), float(high), background=0)
+            return depth_colours(depth, *_depth_range([depth]), background=0)
         case "normal":
             return normal_colours(keyframe.normal.cpu().numpy(), background=0)
         case "confidence":
@@ -159,7 +164,8 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
 
 def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> None:
     """Draw the colour bar of depth into a strip of the picture."""
-    top, length = _HEAD + 20, min(place.shape[0] - _HEAD - 40, 300)
+    top = _HEAD + 20
+    length = min(place.shape[0] - _HEAD - 40, 300)
     if length < 20:
         return
     ramp = np.linspace(high, low, length)[:, None].repeat(14, 1)
@@ -174,7 +180,9 @@ def _tick(
     panel: UInt8[np.ndarray, "h w 3"], axis: int, at: float, text: str, inner: np.ndarray
 ) -> None:
     """Draw a grid line with its number; ``at`` is its position on the axis, in pixels."""
-    where, right, bottom = round(at), _LEFT + int(inner[0]), _TOP + int(inner[1])
+    where = round(at)
+    right = _LEFT + int(inner[0])
+    bottom = _TOP + int(inner[1])
     if axis == 0 and _LEFT <= where <= right:
         cv2.line(panel, (where, _TOP), (where, bottom), _GRID, 1)
         _write(panel, text, (where - 4 * len(text), bottom + 16))

@@ -10,8 +10,8 @@ from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.geometry.camera import Camera
 from geogs.geometry.creases import creased
 
-_BACKGROUND = 255.0
-_GREY = 190.0
+GREY = 190
+"""Level of surfaces without a colour."""
 _AMBIENT = 0.25
 _WIDTH = 480
 """Width of a picture, pixels."""
@@ -41,8 +41,8 @@ class Sight:
 
     def paint(self, colours: UInt8[np.ndarray, "n 3"] | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """The picture (RGB): faces grey, or in the mean colour of their vertices."""
-        picture = np.full((*self.hit.shape, 3), _BACKGROUND)
-        colour = np.full((1, 3), _GREY)
+        picture = np.full((*self.hit.shape, 3), 255.0)
+        colour = np.full((1, 3), float(GREY))
         if colours is not None:
             colour = colours[self.corners].astype(np.float64).mean(1)
         picture[self.hit] = self.light * colour
@@ -69,7 +69,8 @@ def look(
         return Sight(hit, np.zeros((0, 3), np.int64), np.zeros((0, 1)))
     depth, face = render_mesh(vertices, faces, fine, view.T_cw)
     hit = face >= 0
-    corners, smooth = faces[face[hit]], creased(vertices, faces)
+    corners = faces[face[hit]]
+    smooth = creased(vertices, faces)
     points = vertices @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
     ray = fine.rays().numpy()[hit].astype(np.float64)
     weights = _barycentric(points[corners], depth[hit][:, None] * ray)
@@ -112,10 +113,7 @@ def viewpoints(
 
 
 def _from_above(
-    vertices: Float[np.ndarray, "n 3"],
-    T_wc: Float[np.ndarray, "k 4 4"],
-    width: int,
-    height: int,
+    vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], width: int, height: int
 ) -> Viewpoint:
     """View with nearly parallel rays from far above; all above the cameras is cut away."""
     axes = level_axes(T_wc)

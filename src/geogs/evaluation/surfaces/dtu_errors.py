@@ -74,10 +74,12 @@ class DtuScores:
             ("s2d, completeness (mm)", f"{self.s2d_mm:.3f}"),
             ("overall (mm)", f"{self.overall_mm:.3f}"),
             ("  medians of d2s / s2d (mm)", f"{self.d2s_median_mm:.3f} / {self.s2d_median_mm:.3f}"),
-            (f"  left out, {MAX_DISTANCE:g} mm or more (%)",
-             f"{self.d2s_left_out:.2f} / {self.s2d_left_out:.2f}"),
+            (
+                f"  left out, {MAX_DISTANCE:g} mm or more (%)",
+                f"{self.d2s_left_out:.2f} / {self.s2d_left_out:.2f}",
+            ),
             ("  points of data / scan", f"{self.data_points} / {self.scan_points}"),
-        ]  # fmt: skip
+        ]
 
 
 def read_dtu_reference(folder: str | Path, scan: int) -> DtuReference:
@@ -95,7 +97,8 @@ def read_dtu_reference(folder: str | Path, scan: int) -> DtuReference:
     if box.shape != (2, 3) or plane.shape != (4,) or mask["ObsMask"].ndim != 3:
         raise InputError(f"{mask_file} or {plane_file.name} is not of the DTU evaluation.")
     points = read_surface(folder / "Points" / "stl" / f"stl{scan:03}_total.ply").vertices
-    observed, resolution = mask["ObsMask"].astype(bool), float(mask["Res"].ravel()[0])
+    observed = mask["ObsMask"].astype(bool)
+    resolution = float(mask["Res"].ravel()[0])
     return DtuReference(points, observed, box[0], box[1], resolution, plane)
 
 
@@ -139,7 +142,8 @@ def _scores(d2s: Float[np.ndarray, "n"], s2d: Float[np.ndarray, "m"]) -> DtuScor
             f"The mesh and the DTU scan are nowhere nearer than {MAX_DISTANCE:g} mm; is the mesh "
             f"in the world of the scan?"
         )
-    accuracy, completeness = float(near[0].mean()), float(near[1].mean())
+    accuracy = float(near[0].mean())
+    completeness = float(near[1].mean())
     return DtuScores(
         d2s_mm=accuracy,
         s2d_mm=completeness,
@@ -179,7 +183,7 @@ def thin(points: Float[np.ndarray, "n 3"], radius: float) -> Bool[np.ndarray, "n
 
     A removed point removes none. Takes time proportional to the number of points.
     """
-    from geogs.evaluation.surfaces.thinning_kernels import thin_in_order
+    from geogs.evaluation.surfaces.surface_kernels import thin_in_order
 
     kept = np.zeros(len(points), bool)
     # Centred, so that cell numbers stay small in any frame.
@@ -196,7 +200,7 @@ def dense_points(mesh: Surface, spacing: float) -> Float[np.ndarray, "n 3"]:
     spacing; the points are the centres of the cells, where they are in the triangle. Source: the
     Python version of DTU's evaluation that comes with 2DGS.
     """
-    from geogs.evaluation.surfaces.thinning_kernels import grid_samples
+    from geogs.evaluation.surfaces.surface_kernels import grid_samples
 
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int64)

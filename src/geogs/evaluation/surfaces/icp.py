@@ -20,7 +20,9 @@ def icp(points: Float[np.ndarray, "n 3"], target: SurfaceDistance) -> Float[np.n
     the RMSE change by less than 1e-6 relatively. With fewer than six partners the identity is
     returned.
     """
-    T, fitness, rmse = np.eye(4), 0.0, 0.0
+    T = np.eye(4)
+    fitness = 0.0
+    rmse = 0.0
     for _ in range(_ITERATIONS):
         moved = points @ T[:3, :3].T + T[:3, 3]
         distance, closest, normal = target.nearest(moved)
@@ -28,7 +30,8 @@ def icp(points: Float[np.ndarray, "n 3"], target: SurfaceDistance) -> Float[np.n
         if near.sum() < 6:
             return np.eye(4)
         previous = fitness, rmse
-        fitness, rmse = float(near.mean()), float(np.sqrt((distance[near] ** 2).mean()))
+        fitness = float(near.mean())
+        rmse = float(np.sqrt((distance[near] ** 2).mean()))
         change = max(abs(fitness - previous[0]), abs(rmse - previous[1]) / max(rmse, 1e-12))
         if change < _TOLERANCE:
             return T
@@ -51,7 +54,9 @@ def icp_points(
     from scipy.spatial import cKDTree
 
     tree = cKDTree(target)
-    T, moved, previous = np.eye(4), source, (np.inf, np.inf)
+    T = np.eye(4)
+    moved = source
+    previous = (np.inf, np.inf)
     for step in range(_ITERATIONS + 1):
         distance, index = tree.query(moved, distance_upper_bound=_REACH, workers=-1)
         near = np.isfinite(distance)
@@ -74,7 +79,8 @@ def _step(
     if normals is None:
         _, R, t = umeyama(torch.from_numpy(source), torch.from_numpy(target), with_scale=False)
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R.numpy(), t.numpy()
+        T[:3, :3] = R.numpy()
+        T[:3, 3] = t.numpy()
         return T
     centre = source.mean(0)
     jacobian = np.concatenate([normals, np.cross(source - centre, normals)], 1)

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.silhouettes import Silhouette, inside_masks
 from geogs.evaluation.surfaces.surface import Surface, sample_surface
+from geogs.evaluation.surfaces.surface_distance import TriangleTree
 from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
-from geogs.evaluation.surfaces.triangle_tree import TriangleTree
 from geogs.threads import on_one_torch_thread
 
 MAX_DISTANCE = 0.02
@@ -59,15 +59,21 @@ class ObjectScores:
             ("Acc (mm)", f"{self.accuracy_mm:.3f}"),
             ("Comp (mm)", f"{self.completeness_mm:.3f}"),
             ("CD (mm)", f"{self.chamfer_mm:.3f}"),
-            ("  medians of Acc / Comp (mm)",
-             f"{self.accuracy_median_mm:.3f} / {self.completeness_median_mm:.3f}"),
-            (f"Prec / Rec (% < {self.threshold_mm:g} mm)",
-             f"{self.precision:.2f} / {self.recall:.2f}"),
+            (
+                "  medians of Acc / Comp (mm)",
+                f"{self.accuracy_median_mm:.3f} / {self.completeness_median_mm:.3f}",
+            ),
+            (
+                f"Prec / Rec (% < {self.threshold_mm:g} mm)",
+                f"{self.precision:.2f} / {self.recall:.2f}",
+            ),
             (f"F-score at {self.threshold_mm:g} mm (%)", f"{self.f_score:.2f}"),
-            ("  left out, 20 mm or more (%)",
-             f"{self.accuracy_left_out:.2f} / {self.completeness_left_out:.2f}"),
+            (
+                "  left out, 20 mm or more (%)",
+                f"{self.accuracy_left_out:.2f} / {self.completeness_left_out:.2f}",
+            ),
             ("  outside the masks (% of the area)", f"{self.outside_masks:.2f}"),
-        ]  # fmt: skip
+        ]
 
 
 @on_one_torch_thread
@@ -102,7 +108,8 @@ def evaluate_object(
         InputError: a mesh has no triangles, or nothing of the result is inside the masks or near.
     """
     rng = np.random.default_rng(seed)
-    to_truth, to_result = TriangleTree(truth), TriangleTree(reconstruction)
+    to_truth = TriangleTree(truth)
+    to_result = TriangleTree(reconstruction)
     points = sample_surface(reconstruction, samples, rng)[0]
     inside = inside_masks(points, silhouettes)
     outside = 100 * (1 - float(inside.mean()))
@@ -129,7 +136,8 @@ def _scores(
     threshold: float,
     outside: float,
 ) -> ObjectScores:
-    acc, comp = accuracy[np.isfinite(accuracy)], completeness[np.isfinite(completeness)]
+    acc = accuracy[np.isfinite(accuracy)]
+    comp = completeness[np.isfinite(completeness)]
     if not len(acc) or not len(comp):
         raise InputError(
             "Nothing of the result is inside the masks and within 2 cm of the object; is it in "

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.evaluation.surfaces.surface import Surface
 from geogs.geometry.camera import Camera
+from geogs.io.sources.posed.posed_source import PosedImage
 from geogs.threads import on_one_torch_thread, thread_map
 
 _LEAST_ANGLE, _BEST_ANGLE, _MOST_ANGLE = 4.0, 12.0, 30.0
@@ -19,17 +21,6 @@ _NEIGHBOURS, _WINDOW = 4, 9
 _TEXTURE = 4.0
 _OCCLUSION = 0.005
 _NOISE = 1.0
-
-
-@dataclass(frozen=True)
-class EvaluatedPhoto:
-    """A photograph with its true pose."""
-
-    image: UInt8[np.ndarray, "h w 3"]
-    T_cw: Float[np.ndarray, "4 4"]
-    """World to camera."""
-    mask: Bool[np.ndarray, "h w"] | None = None
-    """Pixels of the object; all if none."""
 
 
 @dataclass(frozen=True)
@@ -58,31 +49,30 @@ class PhotoScores:
         """Rows of a table."""
         return [
             ("score, holes count 0 (%)", f"{self.score:.2f}"),
-            (f"  NCC {self.window}x{self.window}, mean / median",
-             f"{self.ncc_mean:.4f} / {self.ncc_median:.4f}"),
+            (
+                f"  NCC {self.window}x{self.window}, mean / median",
+                f"{self.ncc_mean:.4f} / {self.ncc_median:.4f}",
+            ),
             ("  coverage of the masks (%)", f"{self.coverage:.2f}"),
             ("  views / pairs", f"{self.views} / {self.pairs}"),
-        ]  # fmt: skip
+        ]
 
 
-@dataclass(frozen=True)
-class _Agreement:
+class _Agreement(NamedTuple):
     """Agreement of one view with its neighbours."""
 
-    ncc: Float32[np.ndarray, "h w"]
-    """Mean over the neighbours that see a pixel; NaN where none sees it."""
-    covered: Bool[np.ndarray, "h w"]
-    textured: Bool[np.ndarray, "h w"]
-    mask: Bool[np.ndarray, "h w"]
-    pairs: int
+    ncc: Float32[np.ndarray, "k"]
+    """NCC at the textured pixels of the mask, as the mean over the neighbours that see a pixel; NaN
+    where none sees it."""
+    covered: int
+    """Number of covered pixels of the mask."""
+    in_mask: int
+    """Number of pixels of the mask."""
 
 
 @on_one_torch_thread
 def evaluate_photoconsistency(
-    mesh: Surface,
-    camera: Camera,
-    views: Sequence[EvaluatedPhoto],
-    held_out: Sequence[int],
+    mesh: Surface, camera: Camera, views: Sequence[PosedImage], held_out: Sequence[int]
 ) -> PhotoScores:
     """Measure how well a mesh explains held-out photographs by others, without any true surface.
 
@@ -105,7 +95,7 @@ def evaluate_photoconsistency(
     Args:
         mesh: the mesh, in the world of the poses.
         camera: camera of all views.
-        views: photographs with true poses.
+        views: photographs with true poses, and masks of the object where they have any.
         held_out: indices of the views to evaluate; the neighbours may be any.
 
     Raises:
@@ -123,7 +113,7 @@ def evaluate_photoconsistency(
         zip(needed, thread_map(lambda i: _depth(mesh, camera, views[i]), needed), strict=True)
     )
     agreements = thread_map(lambda r: _agreement(r, pairs[r], views, depths, camera), sorted(pairs))
-    return _scores(agreements, camera)
+    return _scores(agreements, sum(map(len, pairs.values())), camera)
 
 
 def choose_neighbours(r: int, T_cw: Sequence[Float[np.ndarray, "4 4"]], most: int) -> list[int]:
@@ -149,7 +139,7 @@ def _converge(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
     return bool((along > 0).all())
 
 
-def _depth(mesh: Surface, camera: Camera, view: EvaluatedPhoto) -> Float32[np.ndarray, "h w"]:
+def _depth(mesh: Surface, camera: Camera, view: PosedImage) -> Float32[np.ndarray, "h w"]:
     return render_mesh(mesh.vertices, mesh.faces, camera, view.T_cw)[0].astype(np.float32)
 
 
@@ -160,15 +150,17 @@ def _grey(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
 def _agreement(
     r: int,
     near: list[int],
-    views: Sequence[EvaluatedPhoto],
+    views: Sequence[PosedImage],
     depths: dict[int, Float32[np.ndarray, "h w"]],
     camera: Camera,
 ) -> _Agreement:
-    view, depth = views[r], depths[r]
+    view = views[r]
+    depth = depths[r]
     grey = _grey(view.image)
     mask = np.ones(depth.shape, bool) if view.mask is None else view.mask
     known = np.isfinite(depth) & mask
-    total, count = np.zeros_like(depth), np.zeros_like(depth)
+    total = np.zeros_like(depth)
+    count = np.zeros_like(depth)
     covered = np.zeros(depth.shape, bool)
     for t in near:
         place, z = _transfer(depth, known, camera, view.T_cw, views[t].T_cw)
@@ -182,7 +174,8 @@ def _agreement(
     ncc = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     mean = cv2.blur(grey, (_WINDOW, _WINDOW))
     variance = cv2.blur(grey * grey, (_WINDOW, _WINDOW)) - mean * mean
-    return _Agreement(ncc, covered, mask & (variance > _TEXTURE**2), mask, len(near))
+    textured = mask & (variance > _TEXTURE**2)
+    return _Agreement(ncc[textured], int((covered & mask).sum()), int(mask.sum()))
 
 
 def _transfer(
@@ -222,9 +215,7 @@ def _visible(
 
 
 def _ncc(
-    a: Float32[np.ndarray, "h w"],
-    b: Float32[np.ndarray, "h w"],
-    valid: Bool[np.ndarray, "h w"],
+    a: Float32[np.ndarray, "h w"], b: Float32[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
     """Normalised cross-correlation over the valid part of each window; NaN where that is small."""
     weight = valid.astype(np.float64)
@@ -245,20 +236,19 @@ def _ncc(
     return np.where(fraction >= 0.5, ncc, np.nan).astype(np.float32)
 
 
-def _scores(agreements: Sequence[_Agreement], camera: Camera) -> PhotoScores:
-    textured = np.concatenate([a.ncc[a.textured] for a in agreements])
-    in_masks = sum(int(a.mask.sum()) for a in agreements)
+def _scores(agreements: Sequence[_Agreement], pairs: int, camera: Camera) -> PhotoScores:
+    textured = np.concatenate([a.ncc for a in agreements])
+    in_masks = sum(a.in_mask for a in agreements)
     if not len(textured):
         raise InputError("The masks of the held-out views show no texture to compare.")
     known = textured[np.isfinite(textured)].astype(np.float64)
-    covered = sum(int((a.covered & a.mask).sum()) for a in agreements)
     return PhotoScores(
         score=100 * float(np.maximum(known, 0).sum() / len(textured)),
         ncc_mean=float(known.mean()) if len(known) else 0.0,
         ncc_median=float(np.median(known)) if len(known) else 0.0,
-        coverage=100 * covered / in_masks,
+        coverage=100 * sum(a.covered for a in agreements) / in_masks,
         views=len(agreements),
-        pairs=sum(a.pairs for a in agreements),
+        pairs=pairs,
         textured=100 * len(textured) / in_masks,
         window=_WINDOW,
         width=camera.width,

@@ -16,7 +16,7 @@ def render_mesh(
 
     ``T_cw`` is world to camera. Both sides of a triangle are seen; a missing one has number -1.
     """
-    from geogs.evaluation.surfaces.raster_kernels import rasterise
+    from geogs.evaluation.surfaces.surface_kernels import rasterise
 
     depth = np.full((camera.height, camera.width), np.inf)
     face = np.full((camera.height, camera.width), -1, np.int64)

@@ -56,9 +56,11 @@ class ReconstructionScores:
             (f"Prec (% < {self.threshold_cm:g} cm)", f"{self.precision_ratio:.2f}"),
             ("F-score (%)", f"{self.f_score:.2f}"),
             ("CD (cm)", f"{self.chamfer_cm:.3f}"),
-            ("  medians of Acc / Comp (cm)",
-             f"{self.accuracy_median_cm:.3f} / {self.completeness_median_cm:.3f}"),
-        ]  # fmt: skip
+            (
+                "  medians of Acc / Comp (cm)",
+                f"{self.accuracy_median_cm:.3f} / {self.completeness_median_cm:.3f}",
+            ),
+        ]
 
 
 @on_one_torch_thread
@@ -134,7 +136,8 @@ def surface_scores(
     icp_shift: float = 0.0,
 ) -> ReconstructionScores:
     """Means, medians and ratios of distances in metres, as cm and %."""
-    acc, comp = 100 * float(accuracy.mean()), 100 * float(completeness.mean())
+    acc = 100 * float(accuracy.mean())
+    comp = 100 * float(completeness.mean())
     precision = 100 * float((accuracy < threshold).mean())
     recall = 100 * float((completeness < threshold).mean())
     return ReconstructionScores(

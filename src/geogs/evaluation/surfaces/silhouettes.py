@@ -77,7 +77,7 @@ def cull_by_masks(mesh: Surface, silhouettes: Sequence[Silhouette]) -> Surface:
 def _inside(
     points: Float[np.ndarray, "n 3"], silhouettes: Sequence[Silhouette]
 ) -> Bool[np.ndarray, "n"]:
-    from geogs.evaluation.surfaces.raster_kernels import keep_inside
+    from geogs.evaluation.surfaces.surface_kernels import keep_inside
 
     kept = np.ones(len(points), bool)
     for s in silhouettes:

@@ -1,10 +1,63 @@
-"""Distances from points to a surface, with the nearest points on it."""
+"""Exact distances of millions of points to a surface, with the nearest points on it."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface
-from geogs.evaluation.surfaces.triangle_tree import TriangleTree
+from geogs.geometry.morton import morton_codes
+from geogs.threads import thread_map
+
+_LEAF = 4
+_BITS = 21
+_BATCH = 8_192
+
+
+class TriangleTree:
+    """A tree of bounding boxes over a mesh's triangles, ordered along a Z-curve.
+
+    Distances are exact, to the nearest of all triangles. Points are queried in the same order, as
+    each distance is bounded by the one before it.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        """Raises InputError if there are no triangles."""
+        if not surface.is_mesh:
+            raise InputError("A surface has no triangles to measure distances to.")
+        corners = np.ascontiguousarray(surface.vertices[surface.faces], np.float64)
+        self._order = _along_curve(corners.mean(1))
+        corners = corners[self._order]
+        self._triangles = corners.reshape(-1, 9)
+        self._boxes = _boxes(corners)
+
+    def __call__(
+        self, points: Float[np.ndarray, "n 3"], maximum: float = np.inf
+    ) -> Float[np.ndarray, "n"]:
+        """Unsigned distances in the unit of the points; inf where they are above ``maximum``."""
+        return self.nearest(points, maximum)[0]
+
+    def nearest(
+        self, points: Float[np.ndarray, "n 3"], maximum: float = np.inf
+    ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Distances, and the nearest triangles; any where a distance is above ``maximum``."""
+        from geogs.evaluation.surfaces.surface_kernels import nearest_triangles
+
+        points = np.asarray(points, np.float64)
+        order = _along_curve(points)
+        parts = np.split(order, range(_BATCH, len(order), _BATCH))
+        distance = np.empty(len(points))
+        face = np.empty(len(points), np.int64)
+
+        def search(part: Int[np.ndarray, "k"]) -> None:
+            d = np.empty(len(part))
+            place = np.zeros(len(part), np.int64)
+            tree = (self._triangles, self._boxes, _LEAF)
+            nearest_triangles(points[part], *tree, maximum, d, place)
+            distance[part] = d
+            face[part] = self._order[place]
+
+        thread_map(search, parts)
+        return distance, face
 
 
 class SurfaceDistance:
@@ -53,7 +106,8 @@ def closest_point_on_triangle(
     height = ((p - a) * normal).sum(1, keepdims=True) / safe
     foot = p - height * normal
     inside = squared[:, 0] > 0
-    best, distance = foot, np.full(len(p), np.inf)
+    best = foot
+    distance = np.full(len(p), np.inf)
     for start, end in ((a, b), (b, c), (c, a)):
         inside &= (np.cross(end - start, foot - start) * normal).sum(1) >= 0
         edge = end - start
@@ -64,3 +118,30 @@ def closest_point_on_triangle(
         best = np.where((d < distance)[:, None], on_edge, best)
         distance = np.minimum(distance, d)
     return np.where(inside[:, None], foot, best)
+
+
+def _boxes(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "k 6"]:
+    """Boxes (low, high) of a full binary tree, node 1 the root; empty ones are inside out."""
+    leaves = -(-len(corners) // _LEAF)
+    size = 1 << (leaves - 1).bit_length()
+    boxes = np.full((2 * size, 6), np.inf)
+    boxes[:, 3:] = -np.inf
+    starts = np.arange(0, len(corners), _LEAF)
+    boxes[size : size + leaves, :3] = np.minimum.reduceat(corners.min(1), starts)
+    boxes[size : size + leaves, 3:] = np.maximum.reduceat(corners.max(1), starts)
+    while size > 1:
+        size //= 2
+        children = boxes[2 * size : 4 * size].reshape(size, 2, 6)
+        boxes[size : 2 * size, :3] = children[..., :3].min(1)
+        boxes[size : 2 * size, 3:] = children[..., 3:].max(1)
+    return boxes
+
+
+def _along_curve(points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+    """The order of points along a Z-curve, quantised by their largest extent."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    low = points.min(0)
+    extent = np.ptp(points, axis=0).max()
+    cells = ((points - low) / (extent or 1.0) * (2**_BITS - 1)).astype(np.int64)
+    return np.argsort(morton_codes(cells, _BITS), kind="stable")

@@ -20,8 +20,6 @@ from geogs.threads import on_one_torch_thread
 VERTEX_WEIGHTED = "vertex-weighted (Splat-SLAM toolbox)"
 AREA_WEIGHTED = "area-weighted (NICE-SLAM), distances to samples"
 
-_SAME_VERTEX = 1e-8
-
 
 @on_one_torch_thread
 def evaluate_vertices(
@@ -51,7 +49,8 @@ def evaluate_vertices(
     rng = np.random.default_rng(seed)
     truth = _without_duplicates(truth)
     reconstruction, shift = _registered(_without_duplicates(reconstruction), truth, use_icp)
-    vertices, true_vertices = reconstruction.vertices, truth.vertices
+    vertices = reconstruction.vertices
+    true_vertices = truth.vertices
     if len(true_vertices) < len(vertices):
         true_targets = sample_surface(truth, len(vertices), rng, stratified=False)[0]
         targets = vertices
@@ -100,7 +99,7 @@ def _require_meshes(reconstruction: Surface, truth: Surface) -> None:
 def _without_duplicates(surface: Surface) -> Surface:
     """Merge vertices at one position, and drop those without a triangle, like trimesh."""
     surface = surface.part(np.ones(len(surface.faces), bool))
-    grid = np.rint(surface.vertices / _SAME_VERTEX).astype(np.int64)
+    grid = np.rint(surface.vertices / 1e-8).astype(np.int64)
     first, number = np.unique(grid, axis=0, return_index=True, return_inverse=True)[1:]
     return Surface(surface.vertices[first], number.reshape(-1)[surface.faces])
 

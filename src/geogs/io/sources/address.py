@@ -1,5 +1,6 @@
 """Addresses of live sources: a camera, a network stream, a pipe, a file played at its pace."""
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,9 +35,12 @@ class LiveAddress:
 def live_address(source: str | Path) -> LiveAddress | None:
     """The address ``camera:0``, ``rtsp://…``, ``-`` or ``play:FILE``; none where it is a path.
 
-    A path made of an URL has lost one of its slashes; it still counts as an URL.
+    A path made of an URL has lost one of its slashes; it still counts as an URL. A file that has
+    such a name is a file.
     """
     words = str(source)
+    if words != "-" and os.path.isfile(words):
+        return None
     if words == "-":
         return LiveAddress("pipe", "")
     if found := _CAMERA.fullmatch(words):

@@ -1,19 +1,27 @@
 """A camera as the user or the data set describes it: intrinsics, distortion, and their origin."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from geogs.camera.distortion import LensModel, with_bend
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.io.sources.account import Account
 from geogs.types import FoundLens
 
 _LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0
 """Limits of focal length / longer image side: fields of view from 157 down to 0.6 degrees."""
 _LARGEST_DISTORTION = 1e5
+_ORDERS: dict[LensModel, tuple[tuple[int, ...], str]] = {
+    "polynomial": ((0, 4, 5, 8), "k1, k2, p1, p2[, k3[, k4, k5, k6]]"),
+    "fisheye": ((0, 4), "k1, k2, k3, k4 of a fisheye"),
+}
+"""Numbers of coefficients of a lens, and their order."""
 GUESS = 0.35
 """Relative standard deviation of a focal length that is only assumed: hand-held cameras have
 fields of view of 40 to 100 degrees."""
+_SQUARE = 1e-3
+"""Largest relative difference of fx and fy that counts as square pixels."""
 _LONGEST_EDGE = 1 << 20
 """Longest image side in pixels."""
 
@@ -59,36 +67,29 @@ class Calibration:
     """Outcome of a self-calibration, if there was one."""
     lens: LensModel = "polynomial"
     """Model of the coefficients."""
+    account: Account = field(default_factory=Account, compare=False)
+    """Findings in its file beside the numbers."""
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(math.isfinite(number) for number in numbers):
-            raise InputError(f"The intrinsics ({self.origin}) hold NaN or infinity; correct them.")
-        if self.lens == "fisheye" and len(self.distortion) not in (0, 4):
-            raise InputError(
-                f"The intrinsics ({self.origin}) have {len(self.distortion)} distortion numbers; "
-                "give k1, k2, k3, k4 of a fisheye."
-            )
-        if len(self.distortion) not in (0, 4, 5, 8):
-            raise InputError(
-                f"The intrinsics ({self.origin}) have {len(self.distortion)} distortion numbers; "
-                "give k1, k2, p1, p2[, k3[, k4, k5, k6]]."
-            )
-        if not all(abs(number) <= _LARGEST_DISTORTION for number in self.distortion):
-            raise InputError(
-                f"The intrinsics ({self.origin}) have distortion numbers that no lens has; correct "
-                "them."
-            )
-        if not all(n is None or 1 <= n <= _LONGEST_EDGE for n in (self.width, self.height)):
-            raise InputError(
-                f"The intrinsics ({self.origin}) are for images of {self.width}x{self.height} "
-                "pixels, which there are not; correct them."
-            )
-        if self.fx <= 0 or self.fy <= 0:
-            raise InputError(
-                f"The focal length ({self.origin}) is {self.fx:g}, {self.fy:g}; "
-                f"it must be positive, in pixels."
-            )
+        count = len(self.distortion)
+        counts, order = _ORDERS[self.lens]
+        is_lens = all(abs(number) <= _LARGEST_DISTORTION for number in self.distortion)
+        is_size = all(n is None or 1 <= n <= _LONGEST_EDGE for n in (self.width, self.height))
+        size = f"{self.width}x{self.height}"
+        focal = f"{self.fx:g}, {self.fy:g}"
+        for is_right, fault in (
+            (all(map(math.isfinite, numbers)), "hold NaN or infinity; correct them"),
+            (count in counts, f"have {count} distortion numbers; give {order}"),
+            (is_lens, "have distortion numbers that no lens has; correct them"),
+            (is_size, f"are for images of {size} pixels, which there are not; correct them"),
+            (
+                min(self.fx, self.fy) > 0,
+                f"say focal length {focal}; it must be positive, in pixels",
+            ),
+        ):
+            if not is_right:
+                raise InputError(f"The intrinsics ({self.origin}) {fault}.")
 
     @property
     def is_distorted(self) -> bool:
@@ -120,6 +121,17 @@ class Calibration:
         found = said.deviation if said is not None and self.is_found_lens else None
         return 0.0 if found is None else found / self.fx
 
+    @property
+    def sentence(self) -> str:
+        """The focal length, the lens and their origin, for the account of the input."""
+        focal = f"fx {self.fx:.1f}"
+        if abs(self.fx / self.fy - 1) > _SQUARE:
+            focal += f", fy {self.fy:.1f}"
+        lens = "fisheye" if self.lens == "fisheye" else "with distortion"
+        kind = f", {lens}" if self.is_distorted else ""
+        certainty = "assumed: " if self.is_guess else ""
+        return f"camera: {focal} pixels{kind} ({certainty}{self.origin})"
+
     def camera(self) -> Camera:
         """The pinhole part. The size must be known."""
         return Camera(self.fx, self.fy, self.cx, self.cy, *self._size())
@@ -134,7 +146,8 @@ class Calibration:
     def with_lens(self, found: FoundLens) -> "Calibration":
         """Return the calibration with the distortion added that was found in images undistorted by
         it. The size must be known."""
-        bend, shift = (found.k1, found.k2), (found.right, found.down)
+        bend = (found.k1, found.k2)
+        shift = (found.right, found.down)
         camera, distortion = with_bend(
             self.camera(), self.distortion, self.lens, bend, found.focal, shift
         )
@@ -150,14 +163,18 @@ class Calibration:
         is_explained = said.is_explained or found.varies  # no constant camera does
         said = replace(said, deviations=own, failure=None, is_explained=is_explained)
         return replace(
-            bent, fx=camera.fx, fy=camera.fy, is_guess=False, is_nominal=False,
+            bent,
+            fx=camera.fx,
+            fy=camera.fy,
+            is_guess=False,
+            is_nominal=False,
             origin=f"{origin}, fx times {found.focal:.4f}",
             refinement=replace(said, deviation=found.deviation_focal * camera.fx),
-        )  # fmt: skip
+        )
 
     def _size(self) -> tuple[int, int]:
-        assert self.width is not None, "fit() the calibration to the images first"
-        assert self.height is not None, "fit() the calibration to the images first"
+        if self.width is None or self.height is None:
+            raise AssertionError("fit() the calibration to the images first")
         return self.width, self.height
 
     def fit(self, width: int, height: int, quarter_turns: int = 0) -> "Calibration":
@@ -179,10 +196,13 @@ class Calibration:
             stored_offset = math.hypot(self.cx - stored[0] / 2, self.cy - stored[1] / 2)
             size = stored if stored_offset < shown_offset else (width, height)
             return replace(self, width=size[0], height=size[1]).fit(width, height, quarter_turns)
-        if _same_shape(self.width, self.height, width, height):
+        if same_shape(self.width, self.height, width, height):
             return self._scaled(width, height)
-        if _same_shape(self.width, self.height, *stored):
-            return self._turned(quarter_turns)._scaled(width, height)
+        if same_shape(self.width, self.height, *stored):
+            turned = self
+            for _ in range(quarter_turns % 4):
+                turned = turned._turned_clockwise()
+            return turned._scaled(width, height)
         raise InputError(
             f"The intrinsics ({self.origin}) are for {self.width}x{self.height} images, but the "
             f"source has {width}x{height}; give those of this camera mode."
@@ -195,16 +215,8 @@ class Calibration:
                 f"The principal point ({self.origin}) {self.cx:g}, {self.cy:g} lies outside the "
                 f"{self.width}x{self.height} image; are the intrinsics for another resolution?"
             )
-        self._check_plausible(camera)
-        return replace(
-            self,
-            fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
-            width=width, height=height,
-        )  # fmt: skip
-
-    def _check_plausible(self, camera: Camera) -> None:
-        """Raise InputError for an implausible focal length."""
-        least, most = _LEAST_FOCAL * camera.long_edge, _MOST_FOCAL * camera.long_edge
+        least = _LEAST_FOCAL * camera.long_edge
+        most = _MOST_FOCAL * camera.long_edge
         squeeze = max(camera.fx / camera.fy, camera.fy / camera.fx)
         if not all(least <= focal <= most for focal in (camera.fx, camera.fy)) or squeeze > 4:
             raise InputError(
@@ -212,12 +224,8 @@ class Calibration:
                 f"images of {camera.width}x{camera.height}; plausible are {least:g} to {most:g}, "
                 "about the same in both directions."
             )
-
-    def _turned(self, quarter_turns: int) -> "Calibration":
-        turned = self
-        for _ in range(quarter_turns % 4):
-            turned = turned._turned_clockwise()
-        return turned
+        scaled = replace(self, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+        return replace(scaled, width=width, height=height)
 
     def _turned_clockwise(self) -> "Calibration":
         """Pixel (x, y) moves to (height - 1 - y, x); the tangential terms turn with the axes."""
@@ -226,14 +234,11 @@ class Calibration:
         if len(distortion) >= 4 and self.lens == "polynomial":
             k1, k2, p1, p2, *radial = distortion
             distortion = (k1, k2, p2, -p1, *radial)
-        return replace(
-            self,
-            fx=self.fy, fy=self.fx, cx=height - 1 - self.cy, cy=self.cx,
-            width=height, height=width, distortion=distortion,
-        )  # fmt: skip
+        turned = replace(self, fx=self.fy, fy=self.fx, cx=height - 1 - self.cy, cy=self.cx)
+        return replace(turned, width=height, height=width, distortion=distortion)
 
 
-def _same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
+def same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
     """Whether one size is the other scaled, up to rounding to whole pixels."""
     scale = max(other_width, other_height) / max(width, height)
     slack = max(1.0, scale) + 0.005 * max(other_width, other_height)

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from geogs.documents import read_text, whole_number
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.camera_keys import MOST_SKEW
 
 _ROW = re.compile(r"(\w+):\s*(.*)")
 _PROJECTION = re.compile(r"P(?:_rect_0)?([0-3])")
@@ -50,8 +51,8 @@ def kitti_camera(path: Path, number: int | None, rectified: bool = True) -> Cali
     found = [c for n in numbers if (c := _kitti_camera(rows, path, n, rectified)) is not None]
     if not found:
         raise InputError(f"{path} holds no camera {number or 0}; is it KITTI's calibration?")
-    first = np.array(_numbers(found[0]))
-    if any(np.abs(np.array(_numbers(c)) - first).max() > SAME * first.max() for c in found):
+    pinholes = np.array([(c.fx, c.fy, c.cx, c.cy) for c in found])
+    if np.ptp(pinholes, axis=0).max() > SAME * pinholes.max():
         raise InputError(
             f"{path} holds cameras that differ; give the folder of images with it, or numbers."
         )
@@ -78,26 +79,35 @@ def kitti_offset(path: Path, number: int) -> Float64[np.ndarray, "3"]:
 def arkit_camera(path: Path) -> Calibration:
     """``width height fx fy cx cy`` of a ``.pincam``. Raises ValueError for something else."""
     width, height, fx, fy, cx, cy = (float(word) for word in read_text(path).split())
-    return Calibration(
-        fx, fy, cx, cy, width=whole_number(width), height=whole_number(height), origin=str(path)
-    )
+    size = whole_number(width), whole_number(height)
+    return Calibration(fx, fy, cx, cy, (), *size, origin=str(path))
 
 
 def scannetpp_camera(document: dict[str, Any], path: Path) -> Calibration:
     """The median of all frames of ``pose_intrinsic_imu.json``. Raises ValueError, KeyError."""
     K = np.median([frame["intrinsic"] for frame in document.values()], axis=0)
-    if K.shape != (3, 3):
-        raise ValueError
-    return Calibration(K[0, 0], K[1, 1], K[0, 2], K[1, 2], origin=str(path))
+    return Calibration(*pinhole_of(K), origin=str(path))
+
+
+def pinhole_of(values: Any) -> tuple[float, float, float, float]:
+    """fx, fy, cx and cy of a matrix, nine numbers by rows or, as Record3D has them, by columns.
+
+    Raises:
+        InputError: pixels are skewed.
+        ValueError: it is something else.
+    """
+    K = np.array(values, dtype=np.float64).reshape(3, 3)
+    if K[2, :2].any():
+        K = K.T
+    if abs(K[0, 1]) > MOST_SKEW:
+        raise InputError(f"A camera matrix with skew {K[0, 1]:g} is not supported; undistort.")
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 def record3d_camera(metadata: dict[str, Any]) -> Calibration:
-    """``K`` by columns, ``w`` and ``h`` of Record3D's ``metadata``. Raises ValueError, KeyError."""
-    K = np.array(metadata["K"], dtype=np.float64).reshape(3, 3).T
-    return Calibration(
-        K[0, 0], K[1, 1], K[0, 2], K[1, 2],
-        width=whole_number(metadata["w"]), height=whole_number(metadata["h"]), origin="Record3D",
-    )  # fmt: skip
+    """``K``, ``w`` and ``h`` of Record3D's ``metadata``. Raises ValueError, KeyError."""
+    size = whole_number(metadata["w"]), whole_number(metadata["h"])
+    return Calibration(*pinhole_of(metadata["K"]), (), *size, origin="Record3D")
 
 
 def _kitti_camera(
@@ -116,7 +126,3 @@ def _kitti_camera(
     else:
         return None
     return Calibration(fx, fy, cx, cy, distortion, width, height, origin=str(path))
-
-
-def _numbers(camera: Calibration) -> tuple[float, ...]:
-    return camera.fx, camera.fy, camera.cx, camera.cy

@@ -1,12 +1,13 @@
 """Sensor depth: depth images beside the colour images, registered to their pixels."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float, Float32
 
 from geogs.camera.distortion import distorted_pixels
 from geogs.geometry.camera import Camera
@@ -47,14 +48,35 @@ class RecordedDepth(Protocol):
 
 
 @dataclass(frozen=True)
+class DepthUnit:
+    """Unit of stored depths."""
+
+    per_metre: float = 1000.0
+    """Units per metre."""
+    origin: str = ""
+    """Who says so: a data set, a file, or the user."""
+    is_stated: bool = False
+    """Whether the user, a file or the app that wrote the depths states it; else it is assumed."""
+
+    def __str__(self) -> str:
+        """In words."""
+        size = "1 m" if self.per_metre == 1 else f"1/{self.per_metre:g} m"
+        return f"{size} a unit" + (f" ({self.origin})" if self.origin else "")
+
+
+MILLIMETRES = DepthUnit(origin="usual")
+"""Unit that most depth images have."""
+PHONE = DepthUnit(origin="the app's", is_stated=True)
+"""Unit of the depth images of apps on phones."""
+
+
+@dataclass(frozen=True)
 class DepthFile:
     """A depth image as stored."""
 
     path: Path
-    per_metre: float = 1000.0
-    """Units per metre."""
+    unit: DepthUnit = MILLIMETRES
     sensor: DepthCamera | None = None
-    """Depth camera; none where its pixels are those of the colour image, at any size."""
     confidence: Path | None = None
     """Picture of the confidence of each pixel, see ``LEAST_CONFIDENCE``."""
     quarter_turns: int = 0
@@ -65,7 +87,7 @@ class DepthFile:
         picture = decoded(self.path, cv2.IMREAD_UNCHANGED).picture
         if picture is None or picture.ndim != 2 or max(picture.shape) > LONGEST:
             return None
-        metres = picture.astype(np.float32) / np.float32(self.per_metre)
+        metres = picture.astype(np.float32) / np.float32(self.unit.per_metre)
         unknown = ~np.isfinite(metres) | (metres < 0)
         if picture.dtype == np.uint16:
             unknown |= picture == INVALID
@@ -78,11 +100,11 @@ class DepthFile:
 
 
 def depth_beside(path: Path, confidence: Path | None = None) -> DepthFile | None:
-    """Return the depth file in millimetres, with its confidence, where these files exist."""
+    """Return an app's depth file in millimetres, with its confidence, where these files exist."""
     if not path.is_file():
         return None
     is_there = confidence is not None and confidence.is_file()
-    return DepthFile(path, confidence=confidence if is_there else None)
+    return DepthFile(path, PHONE, confidence=confidence if is_there else None)
 
 
 @dataclass(frozen=True)
@@ -123,13 +145,10 @@ def sampled(
     """
     known = (depth > 0).astype(np.float32)
     inverse = known / np.where(known > 0, depth, 1)
-    linear, fraction = (
-        cv2.remap(m, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-        for m in (inverse, known)
-    )
-    nearest = cv2.remap(
-        inverse, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0
-    )
+    at = partial(cv2.remap, map1=x, map2=y, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+    linear = at(inverse, interpolation=cv2.INTER_LINEAR)
+    fraction = at(known, interpolation=cv2.INTER_LINEAR)
+    nearest = at(inverse, interpolation=cv2.INTER_NEAREST)
     smooth = (fraction > 0.999) & (np.abs(linear - nearest) < SAME_SURFACE * nearest)
     chosen = np.where(smooth, linear, nearest)
     return np.where(chosen > 0, 1 / np.where(chosen > 0, chosen, 1), 0).astype(np.float32)
@@ -152,16 +171,9 @@ def registered(
     seen = colour.camera()
     z = np.where(z > 0, z, np.inf)
     pixels = distorted_pixels(np.stack([x / z, y / z], 1), seen, colour.distortion, colour.lens)
-    return _nearest_first(pixels, z, seen.width, seen.height)
-
-
-def _nearest_first(
-    pixels: Float[np.ndarray, "n 2"], z: Shaped[np.ndarray, "n"], width: int, height: int
-) -> Float32[np.ndarray, "h w"]:
     u, v = np.rint(pixels).T
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & np.isfinite(z)
+    inside = (u >= 0) & (u < seen.width) & (v >= 0) & (v < seen.height) & np.isfinite(z)
     order = np.argsort(-z[inside], kind="stable")  # the last value written stays
-    at = (v[inside].astype(int) * width + u[inside].astype(int))[order]
-    out = np.zeros(width * height, np.float32)
-    out[at] = z[inside][order]
-    return out.reshape(height, width)
+    out = np.zeros((seen.height, seen.width), np.float32)
+    out[v[inside].astype(int)[order], u[inside].astype(int)[order]] = z[inside][order]
+    return out

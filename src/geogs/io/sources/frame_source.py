@@ -11,6 +11,7 @@ from jaxtyping import Bool, UInt8
 from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.camera.shutter.shutter import Shutter
 from geogs.errors import InputError
+from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.reader import RawFrame, fingerprint_of
@@ -55,6 +56,8 @@ class RecordingPlace:
     """Number of images so far that could not be read, or are of another size."""
     damaged: int = 0
     """Number of frames of which a part is damaged."""
+    scaled: int = 0
+    """Number of frames that were scaled to the size of the others."""
 
     @property
     def read(self) -> int:
@@ -62,14 +65,21 @@ class RecordingPlace:
         return self.frames + self.skipped
 
     def after(self, raw: RawFrame) -> "RecordingPlace":
-        """Progress after one more image; the first skipped and the first damaged one are logged."""
+        """Progress after one more image; the first skipped, scaled or damaged one is logged."""
         if raw.image is None:
             if not self.skipped:
                 _log.warning("%s %s; skipped.", raw.label, raw.why_not)
             return replace(self, skipped=self.skipped + 1)
         if raw.is_damaged and not self.damaged:
             _log.warning("%s is damaged; used as far as it goes.", raw.label)
-        return replace(self, frames=self.frames + 1, damaged=self.damaged + raw.is_damaged)
+        if raw.change and not self.scaled:
+            _log.warning("%s %s, as are others like it.", raw.label, raw.change)
+        return replace(
+            self,
+            frames=self.frames + 1,
+            damaged=self.damaged + raw.is_damaged,
+            scaled=self.scaled + bool(raw.change),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +139,10 @@ class Source:
         """Expected number of frames, unreadable ones included; none where not known beforehand."""
         self.black_is_masked = first.black_is_masked
         """Whether black pixels of frames are masked out."""
-        self.uses_depth = any(images.uses_depth for images in recordings)
+        self.uses_depth = any(images.depth.is_used for images in recordings)
         """Whether frames of any recording have sensor depth."""
-        self.depths_found = [images.depth_found for images in recordings]
-        """A sentence on the sensor depth for each recording."""
+        self.account = sum((images.account for images in recordings), Account())
+        """Findings beside the images: those used, and those not used with the reason."""
         self.uses_poses = any(images.poses.is_used for images in recordings)
         """Whether frames of any recording have pose priors of another tracker."""
         self.is_live = first.is_live
@@ -141,6 +151,8 @@ class Source:
         """Whether the focal length is a guess or nominal, not given by user or data set."""
         self.is_overlay_open = first.is_overlay_open
         """Whether no mask was given, and static overlays may be masked out."""
+        self.takes = first.takes
+        """Part of the images that is used: auto, none, or what ``--take`` names."""
         self.is_shutter_open = first.is_shutter_open
         """Whether the readout is not known yet, and can be estimated from the frames."""
         self.place = ReadingPlace()
@@ -160,6 +172,14 @@ class Source:
         frames = "?" if self.length is None else self.length
         size = f"{self.camera.width}×{self.camera.height}"
         return f"Source({self.name!r}: {self.kind}, {frames} frames of {size})"
+
+    @property
+    def found(self) -> str:
+        """The images as stored, in words."""
+        sizes = (images.reader.info for images in self._recordings)
+        size = ", ".join(dict.fromkeys(f"{info.width}x{info.height}" for info in sizes))
+        count = "images" if self.length is None else f"{self.length} images"
+        return f"{self.name}, {count} of {size} ({self.kind})"
 
     @property
     def dropped(self) -> int:
@@ -203,7 +223,7 @@ class Source:
 
     def spread(self, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Read ``count`` images spread over the recordings, at working size, lens and rows as
-        stored; fewer, or none, where a recording can only be read from its beginning."""
+        stored; none of a live source."""
         each = -(-count // len(self._recordings))
         found = [raw.image for images in self._recordings for raw in images.spread(each)]
         return [image for image in found if image is not None]
@@ -246,11 +266,15 @@ class Source:
 
     def _frames_of(self, number: int) -> Generator[Frame, None, None]:
         """The frames of a recording after the present position."""
-        images, previous = self._recordings[number], self.place.recordings[:number]
+        images = self._recordings[number]
+        previous = self.place.recordings[:number]
         here = (*self.place.recordings, RecordingPlace())[number]
-        index, end = self.place.frames, self.place.time
+        index = self.place.frames
+        end = self.place.time
+        last = end - here.shift
         for raw in images.read(here.read):
             here = here.after(raw)
+            last = raw.timestamp
             if raw.image is None:
                 self.place = ReadingPlace(index, end, (*previous, here))
                 continue
@@ -267,12 +291,14 @@ class Source:
             mask = self.mask if raw.mask is None else raw.mask
             yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows, left, mask)
             index += 1
-        if short := images.why_short(here.read, end - here.shift):
-            _log.warning("%s", short)
         if not here.frames:
             raise InputError(images.why_empty(here.skipped))
+        if short := images.why_short(here.read, last):
+            _log.warning("%s", short)
         if here.skipped > 1:
             _log.warning("%s: skipped %d images that cannot be used.", images.name, here.skipped)
+        if here.scaled > 1:
+            _log.warning("%s: %d images were scaled.", images.name, here.scaled)
         if here.damaged > 1:
             _log.warning("%s: %d images are damaged.", images.name, here.damaged)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from geogs.errors import InputError
 from geogs.io.sources.formats.image_files import Place, has_images
+from geogs.io.sources.named_files import root_above
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.reader import Reader
 
@@ -45,23 +46,16 @@ class Layout:
         if self.holds(folder):
             found = (folder / name for name in self.pictures)
             return Place(folder, next((p for p in found if has_images(p)), folder))
-        folder = folder.absolute()
-        for name in self.pictures:
-            parts = Path(name).parts
-            for depth in range(len(parts), 0, -1):
-                if folder.parts[-depth:] == parts[:depth]:
-                    root = folder.parents[depth - 1]
-                    if has_images(root / name) and self.holds(root):
-                        return Place(root, root / name)
-        return None
+        # ``folder`` may be the folder of images itself, or one on the way to it.
+        ways = ((name, way) for name in self.pictures for way in (Path(name), *Path(name).parents))
+        places = ((root, root / name) for name, way in ways if (root := root_above(folder, way)))
+        found_places = (Place(*p) for p in places if has_images(p[1]) and self.holds(p[0]))
+        return next(found_places, None)
 
 
 def found_in(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
     """The first layout that fits a folder, or the sequence that the folder is part of."""
-    for layout in layouts:
-        if place := layout.place_in(folder):
-            return layout, place
-    return None
+    return next(((layout, p) for layout in layouts if (p := layout.place_in(folder))), None)
 
 
 def found_below(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
@@ -87,8 +81,7 @@ def what_is_missing(folder: Path, layouts: Sequence[Layout]) -> str | None:
     """A sentence on the missing part of a folder that resembles a layout; none if none does."""
     for layout in layouts:
         for sign in layout.signs:
-            found = next(iter(folder.glob(sign)), None)
-            if found is not None:
+            for found in folder.glob(sign):
                 return (
                     f"{folder} looks like {layout.name}, for it holds {found.relative_to(folder)}, "
                     f"but {layout.needs} is missing; unpack all of the sequence."
@@ -98,8 +91,7 @@ def what_is_missing(folder: Path, layouts: Sequence[Layout]) -> str | None:
 
 def _whole(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
     """The layout of a folder that is a sequence itself."""
-    found = ((layout, layout.place_in(folder)) for layout in layouts if layout.holds(folder))
-    return next(((layout, place) for layout, place in found if place), None)
+    return found_in(folder, [layout for layout in layouts if layout.holds(folder)])
 
 
 def _folders(folder: Path) -> Iterator[Path]:

@@ -4,15 +4,17 @@ import hashlib
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from geogs.io.pose_files import FRAMES_PER_SECOND
-from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.account import Account
+from geogs.io.sources.calibration import Calibration, same_shape
 from geogs.threads import ordered_map
 from geogs.types import MeasuredDepth, MeasuredPose, SeenRows
 
@@ -36,6 +38,8 @@ class RawFrame:
     """Whether its decoder found a damaged part."""
     why_not: str = "cannot be read"
     """Reason why there is no image, as a clause."""
+    change: str = ""
+    """Scaling of the image to the size of the others, as a clause."""
     depth: MeasuredDepth | None = None
     """Sensor depth at that time, as stored or at the pixels of a working image."""
     pose: MeasuredPose | None = None
@@ -69,6 +73,8 @@ class RecordingInfo:
     """Clockwise quarter turns from the stored to the upright images."""
     depths: int = 0
     """Number of images with readable sensor depth."""
+    depth_sample: tuple[MeasuredDepth, ...] = ()
+    """Some of these depths, as stored."""
     depth_fault: str = ""
     """Reason why listed depth cannot be used, as a clause."""
     has_poses: bool = False
@@ -77,6 +83,19 @@ class RecordingInfo:
     """Whether the poses are a capture app's tracking, in metres."""
     seconds: float | None = None
     """Approximate time of its last image; none where it is not known."""
+    first_time: float = 0.0
+    """Time of its first image, seconds."""
+    account: Account = field(default_factory=Account)
+    """Findings of the reader beside the images."""
+    pixel_aspect: float = 1.0
+    """Width by height of a pixel of the upright images."""
+
+    @property
+    def last_time(self) -> float:
+        """Approximate time of its last image, seconds."""
+        if self.seconds is not None:
+            return self.seconds
+        return self.first_time + ((self.length or 1) - 1) / self.fps
 
     @property
     def has_depth(self) -> bool:
@@ -110,12 +129,18 @@ class SpreadReader(Protocol):
 
 
 def of_one_size(raw: RawFrame, info: RecordingInfo) -> RawFrame:
-    """The frame; without its image if that has another size than the recording."""
+    """The frame; an image of another size is scaled to that of the recording, as streams do that
+    adapt to a network, or is none if it has another shape."""
     if raw.image is None:
         return raw
     height, width = raw.image.shape[:2]
     if (width, height) == (info.width, info.height):
         return raw
+    if same_shape(width, height, info.width, info.height):
+        way = cv2.INTER_AREA if width > info.width else cv2.INTER_LINEAR
+        scaled = cv2.resize(raw.image, (info.width, info.height), interpolation=way)
+        change = f"is {width}x{height}: scaled to {info.width}x{info.height}"
+        return replace(raw, image=scaled, change=change)
     sizes = f"{width}x{height} but the others are {info.width}x{info.height}"
     return replace(raw, image=None, why_not=f"is {sizes}")
 

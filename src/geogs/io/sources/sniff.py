@@ -9,7 +9,19 @@ from geogs.config import InputConfig
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress, live_address
-from geogs.io.sources.formats import colmap, dtu, nerfstudio, record3d
+from geogs.io.sources.formats import (
+    bundler,
+    colmap,
+    dtu,
+    kapture,
+    metashape,
+    mvsnet,
+    nerfstudio,
+    openmvg,
+    opensfm,
+    realitycapture,
+    record3d,
+)
 from geogs.io.sources.formats.image_files import (
     SUFFIXES,
     ImageList,
@@ -24,14 +36,28 @@ from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import Reader
 from geogs.io.sources.ros.bag import Bag, is_bag
+from geogs.io.sources.views import taken
 from geogs.io.sources.working_images import WorkingImages
 
 # Data sets with their own description often have one of these as well.
-_POSED_FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
-    (dtu.is_dtu, dtu.open_dtu),
-    (nerfstudio.find_transforms, nerfstudio.open_nerfstudio),
-    (colmap.find_model, colmap.open_colmap),
+_POSED_FORMATS: tuple[tuple[str, Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
+    ("DTU cameras.npz", dtu.is_dtu, dtu.open_dtu),
+    ("nerfstudio transforms.json", nerfstudio.find_transforms, nerfstudio.open_nerfstudio),
+    ("COLMAP model", colmap.find_model, colmap.open_colmap),
 )
+_EXPORTS: tuple[tuple[str, Callable[[Path], Path | None], Callable[[Path], PosedSet]], ...] = (
+    ("OpenSfM", opensfm.find_opensfm, opensfm.open_opensfm),
+    ("Metashape", metashape.find_metashape, metashape.open_metashape),
+    ("OpenMVG", openmvg.find_openmvg, openmvg.open_openmvg),
+    ("RealityCapture", realitycapture.find_csv, realitycapture.open_csv),
+    ("RealityCapture", realitycapture.find_xmp, realitycapture.open_xmp),
+    ("MVSNet", mvsnet.find_mvsnet, mvsnet.open_mvsnet),
+    ("Kapture", kapture.find_kapture, kapture.open_kapture),
+    ("Bundler", bundler.find_bundler, bundler.open_bundler),
+    ("VisualSFM", bundler.find_nvm, bundler.open_nvm),
+)
+"""Lists of views by other programs, in a folder after the formats above: name, how the file is
+found, and how it is opened."""
 _POSED_LAYOUTS = tuple(layout for layout in LAYOUTS if layout.posed)
 
 _log = logging.getLogger(__name__)
@@ -64,8 +90,12 @@ def open_source(
         raise InputError(
             "A camera, a stream or a pipe is read alone; give no other source with it."
         )
+    if any(addresses) and config.take not in ("auto", "none"):
+        raise InputError("take cuts recordings only; record the live source, or leave out --take.")
     readers = (
-        _reader(expanded(one), config) if address is None else _live_reader(address, config)
+        taken(_reader(expanded(one), config), config.take)
+        if address is None
+        else _live_reader(address, config)
         for one, address in zip(paths, addresses, strict=True)
     )
     return Source([WorkingImages(reader, config) for reader in readers])
@@ -123,7 +153,8 @@ def open_posed_source(
     """Open an image set together with its known poses.
 
     The format follows from the content: a COLMAP model, nerfstudio's ``transforms.json``, DTU's
-    ``cameras.npz``, or one of the data sets of ``known_layouts.py`` with its true poses.
+    ``cameras.npz``, a list of views by another program (``_EXPORTS``), or one of the data sets of
+    ``known_layouts.py`` with its true poses.
 
     Args:
         path: the folder, or the file with the poses.
@@ -143,7 +174,11 @@ def open_posed_source(
 def _posed_set(path: Path) -> PosedSet:
     if not path.exists():
         raise InputError(f"{path} does not exist; give a folder of images with poses.")
+    exports = [(name, f, opened) for name, find, opened in _EXPORTS if (f := find(path))]
     if path.is_file():
+        if exports:
+            _, file, open_file = exports[0]
+            return _timed_as_read(open_file(file), path.parent)
         if nerfstudio.find_transforms(path):
             return _timed_as_read(nerfstudio.open_nerfstudio(path), path.parent)
         path = path.parent if path.suffix in (".npz", ".bin", ".txt") else path
@@ -151,17 +186,31 @@ def _posed_set(path: Path) -> PosedSet:
         if place := place_of_model(path):
             return open_posed_photographs(place)
         found = found_in(path, WITH_MODEL)
-        for is_format, open_format in _POSED_FORMATS if found is None else ():
-            if is_format(path):
-                return _timed_as_read(open_format(path), path)
-        found = found or found_in(path, _POSED_LAYOUTS) or found_below(path, _POSED_LAYOUTS)
-        if found is not None and (posed := found[0].posed):
-            return posed(found[1])
+        formats = [one for one in _POSED_FORMATS if found is None and one[1](path)]
+        if formats:
+            posed = _without(exports, _timed_as_read(formats[0][2](path), path))
+            for name, _, _ in formats[1:]:
+                posed = posed.left(f"the {name}, as the other poses are there")
+            return posed
+        found = found or found_in(path, _POSED_LAYOUTS)
+        if found is None and exports:
+            _, file, open_file = exports[0]
+            return _without(exports[1:], _timed_as_read(open_file(file), path))
+        found = found or found_below(path, _POSED_LAYOUTS)
+        if found is not None and (open_posed := found[0].posed):
+            return _without(exports, open_posed(found[1]))
     raise InputError(
-        f"{path} holds no images with known poses (COLMAP model, nerfstudio transforms.json, DTU "
-        "cameras.npz, or a data set with its true poses); use --poses auto for photographs, "
-        "geogs run for a video."
+        f"{path} holds no images with known poses (COLMAP, nerfstudio, DTU, OpenSfM, Metashape, "
+        "OpenMVG, RealityCapture, MVSNet, Kapture, Bundler, or a data set with its true poses); "
+        "use --poses auto for photographs, geogs run for a video."
     )
+
+
+def _without(exports: Sequence[tuple[str, Path, object]], posed: PosedSet) -> PosedSet:
+    """Name the lists of views that are not used."""
+    for name, file, _ in exports:
+        posed = posed.left(f"{file} of {name}, as the other poses are there")
+    return posed
 
 
 def _timed_as_read(posed: PosedSet, folder: Path) -> PosedSet:

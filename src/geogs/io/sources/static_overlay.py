@@ -8,14 +8,15 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Shaped, UInt8
 
 IMAGES = 16
 """Number of compared images, spread over a video."""
 LEAST_FRAMES = 40
 """Shortest video that is searched, in frames: in about a second a camera hardly moves, and what it
 rotates about stands still."""
-_LEAST_IMAGES = 8
+LEAST_IMAGES = 8
+"""Least number of compared images."""
 _AGREEMENT = 0.9
 """Fraction of images in which a pixel must look the same, so that a glitch has no effect."""
 _BLUR = 1.0
@@ -26,7 +27,7 @@ _MOTION = 0.15
 """Largest apparent motion of a static pixel, in pixels."""
 _NOISE = 1.5
 """Largest additional change of a static pixel, in grey levels."""
-_CHANGE = 12.0
+CHANGE = 12.0
 """Change of a pixel, in grey levels, that shows that its content moves."""
 _LEAST_MOVING = 0.4
 """Least fraction of such pixels: with fewer the camera rests or hardly moves, and distant points
@@ -40,6 +41,10 @@ _LEAST_AREA, _LEAST_GRADIENTS = 0.002, 0.001
 _LEAST_RATIO = 0.05
 """Least fraction of still gradients in an unchanged region: a sky looks the same, too, wherever the
 camera is."""
+_RIM = 0.12
+"""Width of the border that stands still behind a turntable, relative to the image."""
+_LEAST_TURNING, _LEAST_SEEN = 0.05, 0.03
+"""Least part of the middle that moves, and of the border that has texture."""
 
 
 def static_overlay(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"] | None:
@@ -52,25 +57,52 @@ def static_overlay(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarra
     Args:
         images: grey, upright and of one size, spread over a video.
     """
-    if len(images) < _LEAST_IMAGES:
+    if len(images) < LEAST_IMAGES:
         return None
-    smooth = np.stack([cv2.GaussianBlur(image, (0, 0), _BLUR) for image in images])
-    usual = np.median(smooth, axis=0).astype(np.float32)
-    changes = np.abs(smooth - usual)
-    rank = int(_AGREEMENT * (len(images) - 1))
-    change = np.partition(changes, rank, axis=0)[rank]
-    if (change > _CHANGE).mean() < _LEAST_MOVING:
+    change, slope, same = _seen(images)
+    if (change > CHANGE).mean() < _LEAST_MOVING:
         return None
-    slope = _slope(usual)
-    same = change < _MOTION * slope + _NOISE
     found = _parts(same, same & (slope > _TEXTURE))
     return found if found.any() else None
 
 
-def _slope(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Length of the gradient per pixel."""
-    across, down = (cv2.Sobel(image, cv2.CV_32F, x, 1 - x, scale=1 / 8) for x in (1, 0))
-    return np.hypot(across, down)
+def is_turntable(images: Sequence[UInt8[np.ndarray, "h w"]]) -> bool:
+    """Whether only the middle of grey images moves, before a border that has texture and stays."""
+    if len(images) < LEAST_IMAGES:
+        return False
+    change, slope, same = _seen(images)
+    rim = np.ones(change.shape, dtype=bool)
+    down, right = (round(_RIM * side) for side in change.shape)
+    rim[down:-down, right:-right] = False
+    textured = rim & (slope > _TEXTURE)
+    moves = (change > CHANGE)[~rim].mean() > _LEAST_TURNING
+    if not moves or textured.sum() <= _LEAST_SEEN * rim.sum():
+        return False
+    return bool(same[textured].mean() > _AGREEMENT)
+
+
+def usual_and_change(
+    stack: Shaped[np.ndarray, "n h w *c"], part: float
+) -> tuple[Float32[np.ndarray, "h w *c"], Float32[np.ndarray, "h w"]]:
+    """Median of grey or coloured images, and the difference from it that ``part`` of them stay
+    below, that of the colour which differs most."""
+    usual = np.median(stack, axis=0).astype(np.float32)
+    changes = np.abs(stack - usual)
+    changes = changes.max(-1) if changes.ndim == 4 else changes
+    rank = int(part * (len(stack) - 1))
+    return usual, np.partition(changes, rank, axis=0)[rank]
+
+
+def _seen(
+    images: Sequence[UInt8[np.ndarray, "h w"]],
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Difference from the median of smoothed images, gradient per pixel, and where the
+    difference is no more than the gradient lets stand still."""
+    smooth = np.stack([cv2.GaussianBlur(image, (0, 0), _BLUR) for image in images])
+    usual, change = usual_and_change(smooth, _AGREEMENT)
+    across, down = (cv2.Sobel(usual, cv2.CV_32F, x, 1 - x, scale=1 / 8) for x in (1, 0))
+    slope = np.hypot(across, down)
+    return change, slope, change < _MOTION * slope + _NOISE
 
 
 def _parts(

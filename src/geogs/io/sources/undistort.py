@@ -19,6 +19,8 @@ from geogs.io.sources.calibration import Calibration
 
 FieldOfView = float | Literal["auto"]
 """Degrees along the longer side of the working image."""
+WHOLE = 0.95
+"""Fraction of the image from which on a part counts as the whole."""
 FISHEYE_VIEW = 90.0
 """Default field of view of a fisheye, degrees; a pinhole image would stretch more."""
 
@@ -41,6 +43,36 @@ def mask_as_image(
     return way(np.repeat(grey[..., None], 3, 2))[..., 0] > 127
 
 
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of an image, in fractions of its width and height."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def of(self, camera: Camera) -> Camera:
+        """The camera of the part, in whole pixels."""
+        left, right = round(self.left * camera.width), round(self.right * camera.width)
+        top, bottom = round(self.top * camera.height), round(self.bottom * camera.height)
+        return replace(
+            camera, cx=camera.cx - left, cy=camera.cy - top, width=right - left, height=bottom - top
+        )
+
+
+def window_around(valid: Bool[np.ndarray, "h w"]) -> Window | None:
+    """The part of the images that holds all valid pixels; none if that is nearly the whole."""
+    rows = np.flatnonzero(valid.any(axis=1))
+    columns = np.flatnonzero(valid.any(axis=0))
+    if not len(rows) or len(rows) * len(columns) > WHOLE * valid.size:
+        return None
+    height, width = valid.shape
+    return Window(
+        columns[0] / width, rows[0] / height, (columns[-1] + 1) / width, (rows[-1] + 1) / height
+    )
+
+
 class Rectifier:
     """Makes working images: longer side at most ``long_edge`` pixels, straight lines straight.
 
@@ -55,15 +87,20 @@ class Rectifier:
         long_edge: int,
         field_of_view: FieldOfView = "auto",
         focal: float | None = None,
+        window: Window | None = None,
     ) -> None:
         """``focal`` of the working image instead of a field of view: pixels that the lens did not
-        see get the colour of the border.
+        see get the colour of the border. ``window``: the working image is only this part, and
+        ``long_edge`` is that of the part.
 
         Raises InputError if the lens folds the image, or its view is too narrow.
         """
         source = calibration.camera()
         distortion = calibration.distortion if calibration.is_distorted else ()
-        self._distortion, self._lens = distortion, calibration.lens
+        self._distortion = distortion
+        self._lens = calibration.lens
+        if window is not None:
+            long_edge = round(long_edge * source.long_edge / window.of(source).long_edge)
         enlarges = long_edge <= 0 or long_edge >= source.long_edge
         resized = source if enlarges else source.with_long_edge(long_edge)
         self.resized_camera = resized
@@ -84,8 +121,9 @@ class Rectifier:
             self.zoom = max(_zoom_for(FISHEYE_VIEW, resized), bends.least_zoom())
         elif distortion:
             self.zoom = max(1.0, bends.least_zoom(1.0))
-        if calibration.is_distorted or self.zoom != 1:
-            self.camera = _zoomed(resized, self.zoom)
+        if calibration.is_distorted or self.zoom != 1 or window is not None:
+            zoomed = _zoomed(resized, self.zoom)
+            self.camera = zoomed if window is None else window.of(zoomed)
             self._maps = lens_maps(self.camera, resized, distortion, calibration.lens)
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -103,8 +141,8 @@ class Rectifier:
         return resized_to(self.size, image)
 
     def straightened(
-        self, image: UInt8[np.ndarray, "h w 3"], offsets: Float[np.ndarray, "h w 2"] | None = None
-    ) -> UInt8[np.ndarray, "h w 3"]:
+        self, image: UInt8[np.ndarray, "h w 3"], offsets: Float[np.ndarray, "h2 w2 2"] | None = None
+    ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The working image of a resized image.
 
         ``offsets`` are added to the position in the resized image, by the lens alone, of each
@@ -141,7 +179,8 @@ class _Bending:
         """Whether the border of the zoomed image lies in the source, inside any fold."""
         source = self.source
         rays = _border_rays(_zoomed(source, zoom))
-        pixels, inner = self._pixels(rays), self._pixels(0.99 * rays)
+        pixels = self._pixels(rays)
+        inner = self._pixels(0.99 * rays)
         centre = np.array([source.cx, source.cy])
         grows = np.linalg.norm(pixels - centre, axis=1) > np.linalg.norm(inner - centre, axis=1)
         inside = (pixels >= -0.5) & (pixels <= (source.width - 0.5, source.height - 0.5))

@@ -4,14 +4,18 @@ A format supplies a reader of stored images; :class:`WorkingImages` adds the com
 selection, the calibration, the shutter, the working resolution and reading ahead.
 """
 
+import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
 from geogs.camera.shutter.angular_motion import AngularMotion
-from geogs.camera.shutter.neighbours import with_angular_motion
+from geogs.camera.shutter.rates import with_angular_motion
 from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.camera.shutter.rows import RowOffsets
 from geogs.camera.shutter.shutter import Shutter
@@ -20,12 +24,16 @@ from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
+from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_check import ANCHORS, STEPS, MeasuredView, ratio_to_depth
 from geogs.io.sources.depth_files import RecordedDepth, RectifiedDepth
+from geogs.io.sources.depth_unit import ChosenDepth, chosen_depth
 from geogs.io.sources.frame_masks import FrameMasks, masked_out
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.live.live_reader import LiveReader
-from geogs.io.sources.pose_priors import chosen_poses
+from geogs.io.sources.pose_clock import Turning, on_clock, turning_rates
+from geogs.io.sources.pose_priors import ChosenPoses, chosen_poses
 from geogs.io.sources.reader import (
     RawFrame,
     Reader,
@@ -34,12 +42,14 @@ from geogs.io.sources.reader import (
     read_ahead,
     read_side_by_side,
 )
-from geogs.io.sources.undistort import Rectifier, mask_as_image
+from geogs.io.sources.undistort import Rectifier, mask_as_image, window_around
 from geogs.threads import Each
 from geogs.types import MeasuredDepth, SeenRows
 
 LEAST_EDGE = 12
 """Least shorter side of a working image in pixels."""
+MOST_COMPARED = 600
+"""Largest number of images whose motion is compared with that of given poses."""
 MOST_OF = 0.97
 """Fraction of the announced length below which a recording is reported as cut off."""
 
@@ -58,22 +68,21 @@ class WorkingImages:
         shutter: Shutter | None = None,
         focal: float | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
+        poses: ChosenPoses | None = None,
+        depth: ChosenDepth | None = None,
     ) -> None:
         """``calibration`` of the upright images, instead of the reader's.
 
         ``shutter``, instead of the settings'; ``focal`` of the working images, instead of the
-        settings'; ``overlay``, true where all images at working size show a static overlay.
+        settings'; ``overlay``, true where all images at working size show a static overlay;
+        ``poses`` by the clock of the images, and ``depth``, instead of the settings'.
         """
         info = reader.info
-        _check_selection(config, info.length)
-        if config.depth == "sensor" and not info.has_depth:
-            why = f": {info.depth_fault}" if info.depth_fault else ""
+        if info.length is not None and config.start >= info.length:
             raise InputError(
-                f"{info.name} has no depth of a sensor beside its images that can be read here"
-                f"{why}; leave out --depth, or give that of the images."
+                f"start is {config.start}, but the source has only {info.length} frames; give a "
+                "smaller one."
             )
-        self.poses = chosen_poses(config.poses, info)
-        """Pose priors beside the images."""
         self.reader = reader
         """Reads the stored images."""
         self.name = info.name
@@ -82,46 +91,96 @@ class WorkingImages:
         """Frames per second after the stride, nominal."""
         self._config = config
         self.calibration = calibration or resolve_intrinsics(
-            config.intrinsics, info.calibration, info.width, info.height, info.quarter_turns
+            config.intrinsics,
+            info.calibration,
+            info.width,
+            info.height,
+            info.quarter_turns,
+            info.pixel_aspect,
         )
         """The camera of the images as stored, upright, with its distortion."""
         given = Shutter() if config.readout == "auto" else Shutter(config.readout, "as given")
         self.shutter = shutter or given
         """The shutter by which rows are rectified; a global one until it is estimated."""
         self._focal = focal
-        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
-        self.camera = self._rectifier.camera
-        """The pinhole camera of the working images."""
-        check_large_enough(self.camera, info.name)
         masks = None if config.mask is None else expanded(config.mask)
         self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
-        self.mask: Bool[np.ndarray, "h w"] | None = None
-        """Valid pixels of every frame; none where all are valid."""
+        valid = None if overlay is None else ~overlay
         if masks is not None and self._masks is None:
-            self.mask = self._straight(read_mask(masks, (info.height, info.width)))
-        elif overlay is not None:
-            self.mask = self._straight(~overlay)
+            valid = read_mask(masks, (info.height, info.width))
+        rectify = partial(
+            Rectifier, self.calibration, config.long_edge, config.field_of_view, focal
+        )
+        self._rectifier = rectify()
+        if valid is not None:
+            window = window_around(mask_as_image(self._rectifier, valid))
+            self._rectifier = self._rectifier if window is None else rectify(window)
+        self.camera = self._rectifier.camera
+        """The pinhole camera of the working images: of the part that holds all valid pixels."""
+        check_large_enough(self.camera, info.name)
+        self.mask: Bool[np.ndarray, "h w"] | None = (
+            None if valid is None else mask_as_image(self._rectifier, valid)
+        )
+        """Valid pixels of every frame; none where all are valid."""
         self._overlay = overlay
         self.black_is_masked = self._masks is not None
         """Whether black pixels of frames are masked out."""
         self.is_live = isinstance(reader, LiveReader)
         """Whether the source is live."""
-        self.uses_depth = config.depth != "none" and info.has_depth
-        """Whether images have sensor depth."""
-
-    def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
-        """Undistort a mask of an image as stored, or at working size, like an image."""
-        return mask_as_image(self._rectifier, mask)
+        self.poses = poses or self._on_clock(chosen_poses(config.poses, info))
+        """Pose priors beside the images."""
+        self.depth = depth or chosen_depth(config, info)
+        """Sensor depth beside the images."""
+        if depth is None:
+            ratio = ratio_to_depth(self._measured_pairs(), self.camera)
+            self.depth = self.depth.checked(ratio, self.is_calibration_open, info.name)
 
     @property
-    def depth_found(self) -> str:
-        """A sentence on the sensor depth."""
+    def account(self) -> Account:
+        """Findings beside the images: those used, and those not used with the reason."""
         info = self.reader.info
-        if info.has_depth:
-            of = "" if info.length is None else f" of {info.length}"
-            return f"The depth of a sensor beside {info.name} is used: {info.depths}{of} images."
-        why = info.depth_fault or "none lies beside the images, or none that can be read here"
-        return f"No depth of a sensor is used for {info.name}: {why}."
+        own = Account((self.calibration.sentence,))
+        beside = self.depth.account + self.poses.account
+        return own + beside + self.calibration.account + info.account
+
+    def _on_clock(self, poses: ChosenPoses) -> ChosenPoses:
+        """Poses of a file by the clock of the images. Raises InputError if the clocks share no time
+        and nothing tells by how much they differ."""
+        length = self.reader.info.length
+        if poses.file is None or self.is_live or length is None:
+            return poses
+
+        def turning() -> Turning:
+            images = map(self._at_working_size, self.reader.read(0, MOST_COMPARED, 1))
+            return turning_rates(images, self.rolling_camera)
+
+        first, last = self.reader.info.first_time, self.reader.info.last_time
+        trajectory, change = on_clock(poses.file, first, last, turning, self._config.poses)
+        said = Account((f"poses: {change}",) if change else ())
+        return replace(poses, file=trajectory, account=poses.account + said)
+
+    def _measured_pairs(self) -> Iterator[tuple[MeasuredView, MeasuredView]]:
+        """Pairs of images with depth and pose, spread over the recording; none without priors."""
+        length = self.reader.info.length or 0
+        is_both = self.depth.is_used and self.poses.is_used
+        if not (is_both and isinstance(self.reader, SpreadReader)):
+            return
+        for one, two in itertools.product(np.linspace(0, length, ANCHORS + 2)[1:-1], STEPS):
+            chosen = [n for n in (int(one), int(one) + two) if n < length]
+            views = [self._measured_view(raw) for raw in self.reader.spread(chosen)]
+            if len(views) == 2 and views[0] is not None and views[1] is not None:
+                yield views[0], views[1]
+
+    def _measured_view(self, raw: RawFrame) -> MeasuredView | None:
+        """An image with its depth and pose, rows as stored; none where one is missing."""
+        raw = of_one_size(raw, self.reader.info)
+        pose = self.poses.of(raw.timestamp, raw.pose)
+        depth = self._rectified(raw.depth)
+        metres = None if depth is None else depth.metres()
+        if raw.image is None or pose is None or metres is None:
+            return None
+        grey = cv2.cvtColor(self._rectifier(raw.image), cv2.COLOR_RGB2GRAY)
+        return MeasuredView(grey, metres, pose.T_cw.numpy())
 
     @property
     def is_calibration_open(self) -> bool:
@@ -135,34 +194,52 @@ class WorkingImages:
         shutter: Shutter | None = None,
         focal: float | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
+        stride: int | None = None,
     ) -> "WorkingImages":
         """The same images with another calibration, another readout, another focal length of the
-        working camera, or a static overlay masked out."""
+        working camera, a static overlay masked out, or at another stride."""
         info = self.reader.info
-        known = calibration.fit(info.width, info.height) if calibration else self.calibration
         return WorkingImages(
-            self.reader, self._config, known, shutter or self.shutter, focal or self._focal,
+            self.reader,
+            replace(self._config, stride=stride or self._config.stride),
+            calibration.fit(info.width, info.height) if calibration else self.calibration,
+            shutter or self.shutter,
+            focal or self._focal,
             self._overlay if overlay is None else overlay,
-        )  # fmt: skip
+            self.poses,
+            self.depth,
+        )
 
     def as_recorded(self) -> "WorkingImages":
         """All images of the selection at stride 1, without row rectification."""
-        config = replace(self._config, stride=1)
-        return WorkingImages(
-            self.reader, config, self.calibration, Shutter(), self._focal, self._overlay
-        )
+        return self.known_better(shutter=Shutter(), stride=1)
 
     def spread(self, count: int) -> Iterator[RawFrame]:
         """Read ``count`` images spread over the selection, at working size, lens and rows as
-        stored; fewer, or none, where the recording can only be read from its beginning."""
-        config, length = self._config, self.reader.info.length
-        if length is None and self.reader.info.seconds is not None:
-            length = round(self.reader.info.seconds * self.reader.info.fps)
-        if length is None or not isinstance(self.reader, SpreadReader):
+        stored; over its beginning where a recording cannot be entered at enough places."""
+        if self.is_live:
             return iter(())
-        places = np.arange(length)[config.start : config.stop]
-        chosen = places[np.unique(np.linspace(0, len(places) - 1, count).round().astype(int))]
-        return map(self._at_working_size, self.reader.spread(chosen.tolist()))
+        info = self.reader.info
+        config = self._config
+        length = info.length
+        if length is None and info.seconds is not None:
+            length = round(info.seconds * info.fps)
+        places = range(length or config.start + MOST_COMPARED)[config.start : config.stop]
+        if length and places and isinstance(self.reader, SpreadReader):
+            chosen = np.unique(np.linspace(0, len(places) - 1, count).round().astype(int))
+            entered = self.reader.spread([places[k] for k in chosen.tolist()])
+            found = list(map(self._at_working_size, entered))
+            if 2 * len(found) >= count:
+                return iter(found)
+        beginning = places[:MOST_COMPARED]
+        step = max(len(beginning) // count, 1)
+        stop = config.start + len(beginning)
+        return map(self._at_working_size, self.reader.read(config.start, stop, step))
+
+    @property
+    def takes(self) -> str:
+        """Part of the images that is used, as the settings name it."""
+        return self._config.take
 
     @property
     def is_overlay_open(self) -> bool:
@@ -192,9 +269,10 @@ class WorkingImages:
     @property
     def length(self) -> int | None:
         """Expected number of images, unreadable ones included; none where not known beforehand."""
-        config, length = self._config, self.reader.info.length
+        length = self.reader.info.length
         if length is None:
             return None
+        config = self._config
         return len(range(length)[config.start : config.stop : config.stride])
 
     def read(self, first: int) -> Iterator[RawFrame]:
@@ -205,7 +283,8 @@ class WorkingImages:
 
     def _working(self, first: int) -> Iterator[RawFrame]:
         """The working images of the selection from its ``first`` on."""
-        config, reader = self._config, self.reader
+        config = self._config
+        reader = self.reader
         start = config.start + first * config.stride
         if self.shutter.readout:
             yield from self._with_rows_rectified(start)
@@ -238,16 +317,16 @@ class WorkingImages:
                 yield raw
                 continue
             valid = self._masks.read(raw.name, (self.reader.info.height, self.reader.info.width))
-            straight = None if valid is None else self._straight(valid)
+            straight = None if valid is None else mask_as_image(self._rectifier, valid)
             yield replace(raw, image=masked_out(raw.image, straight), mask=straight)
 
     def _rectified(
         self, depth: MeasuredDepth | None, moved: Float[np.ndarray, "h w 2"] | None = None
     ) -> MeasuredDepth | None:
         """Stored depth for the pixels of a working image; ``moved`` are its row offsets."""
-        if not (self.uses_depth and isinstance(depth, RecordedDepth)):
+        if not (self.depth.is_used and isinstance(depth, RecordedDepth)):
             return None
-        return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
+        return RectifiedDepth(self.depth.of(depth), self.calibration, self._rectifier, moved)
 
     def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
         """Working images of a rolling shutter, from an index of the source on.
@@ -255,14 +334,16 @@ class WorkingImages:
         Rotation is measured between neighbours in the source, whatever the stride, and the
         image before the first is read, too.
         """
-        config, rolling, readout = self._config, self.rolling_camera, self.shutter.readout
+        config = self._config
+        rolling = self.rolling_camera
+        readout = self.shutter.readout
         before = min(start, 1)
         stop = None if config.stop is None else config.stop + 1
+        end = math.inf if config.stop is None else config.stop - start
 
         def is_selected(position: int) -> bool:
             after = position - before
-            inside = config.stop is None or start + after < config.stop
-            return after >= 0 and after % config.stride == 0 and inside
+            return 0 <= after < end and after % config.stride == 0
 
         images = map(self._at_working_size, self.reader.read(start - before, stop, 1))
         offsets = RowOffsets(rolling, self.camera)
@@ -274,7 +355,8 @@ class WorkingImages:
             nodes = offsets.nodes(AngularMotion() if turning.is_still else turning, readout)
             moved = None if turning.is_still else offsets.dense(nodes)
             image = self._rectifier.straightened(raw.image, moved)
-            depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
+            depth = self._rectified(raw.depth, moved)
+            rows = offsets.seen(nodes, self.shutter)
             return replace(raw, image=image, depth=depth, rows=rows)
 
         each: Each = map if self.is_live else read_side_by_side
@@ -301,13 +383,6 @@ class WorkingImages:
         if skipped:
             return f"{self.name}: none of its {skipped} images can be used."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."
-
-
-def _check_selection(config: InputConfig, length: int | None) -> None:
-    if length is not None and config.start >= length:
-        raise InputError(
-            f"start is {config.start}, but the source has only {length} frames; give a smaller one."
-        )
 
 
 def check_large_enough(camera: Camera, name: str) -> None:

@@ -93,8 +93,10 @@ def read_rows(path: Path) -> dict[int, SeenRows]:
         return {}
     try:
         tensors = load_file(path)
-        ids, doubt = tensors["keyframe_id"].long(), tensors["doubt"].double()
-        offset, seconds = tensors["offset"].half(), tensors["seconds"].half()
+        ids = tensors["keyframe_id"].long()
+        doubt = tensors["doubt"].double()
+        offset = tensors["offset"].half()
+        seconds = tensors["seconds"].half()
         if seconds.ndim != 3 or offset.shape != (*seconds.shape, 2):
             raise ValueError("it has no rows and columns")
         if not ids.shape == doubt.shape == seconds.shape[:1]:

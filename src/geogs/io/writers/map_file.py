@@ -107,7 +107,8 @@ def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFi
 
 def _frame(views: dict[str, Any]) -> tuple[Float64[np.ndarray, "3"], float]:
     """Origin and unit of the map's own frame. Raises an error of ``UNUSABLE`` if they are none."""
-    origin, unit = np.array(views["origin"], np.float64).reshape(3), float(views["unit"])
+    origin = np.array(views["origin"], np.float64).reshape(3)
+    unit = float(views["unit"])
     if not (holds((), origin) and holds((POSITIVE,), unit)):
         raise ValueError("a number is not finite, or no length")
     return origin, unit
@@ -223,7 +224,9 @@ def load_map_views(
 
 
 def _views(file: MapFile) -> MapViews:
-    said, tensors, disks = file.metadata["views"], file.tensors, file.disks
+    said = file.metadata["views"]
+    tensors = file.tensors
+    disks = file.disks
     position = tensors.get("map_position", disks.position).to(disks.position)
     scale = tensors.get("map_scale", disks.scale).to(disks.scale)
     if position.shape != disks.position.shape or scale.shape != disks.scale.shape:

@@ -39,7 +39,8 @@ def write_mesh(
 ) -> None:
     """Write a triangle mesh as binary PLY, with RGB and normals at the vertices where given."""
     triangles = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", (3,))])
-    triangles["count"], triangles["corners"] = 3, faces
+    triangles["count"] = 3
+    triangles["corners"] = faces
     _write(
         path,
         [
@@ -88,7 +89,8 @@ def write_splats(
     """
     rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
     scales = ("scale_0", "scale_1") if is_flat else ("scale_0", "scale_1", "scale_2")
-    position, normal = disks.position.cpu().numpy(), disks.normal.cpu().numpy()
+    position = disks.position.cpu().numpy()
+    normal = disks.normal.cpu().numpy()
     rotation = disks.quaternion.cpu().numpy()
     opacity = disks.opacity.cpu().double().numpy().clip(1e-6, 1 - 1e-6)
     log_scale = np.log(splat_scales(disks))

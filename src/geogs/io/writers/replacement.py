@@ -101,7 +101,8 @@ def recover(folder: Path) -> None:
 
 def _check(place: Directory) -> None:
     """Raise the errors of writing a whole result early."""
-    names, listed = place.names(), _listed(place)
+    names = place.names()
+    listed = _listed(place)
     if any(mark in names and mark not in listed for mark in _MARKS):
         raise OutputError(
             f"{place.path} holds a result that has no list of its files ({LIST}), as an earlier "

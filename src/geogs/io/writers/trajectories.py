@@ -35,9 +35,9 @@ def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     Reading it again gives the same numbers up to rounding.
     """
     wxyz = _quaternions(trajectory)
-    rows = np.column_stack([
-        trajectory.timestamps, trajectory.T_wc[:, :3, 3], wxyz[:, 1:], wxyz[:, :1]
-    ])  # fmt: skip
+    rows = np.column_stack(
+        [trajectory.timestamps, trajectory.T_wc[:, :3, 3], wxyz[:, 1:], wxyz[:, :1]]
+    )
     text = "".join(_row(row, " ") for row in rows)
     write_text(path, f"# timestamp tx ty tz qx qy qz qw\n{text}")
 

@@ -7,8 +7,8 @@ well (EM). Focal length and principal point are freed one after the other, where
 cost by much (forward selection): a depth that is still wrong would be explained by either.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -23,14 +23,11 @@ from geogs.bundle.uncertainty.varying_intrinsics import (
     VaryingEvidence,
     VaryingPrior,
 )
-from geogs.geometry.camera import Camera
-from geogs.loop.camera.found import FrameLenses
-from geogs.loop.keyframe_matches import KeyframeMatches, Shifts
+from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.tracking.frame_lenses import shift_frames, shifts_of_own, sizes_of_frames
 from geogs.tracking.keyframe_uncertainty import said_of_frame_lenses
 from geogs.types import FrameLens
-from geogs.world.edges import Edge, Pair
-from geogs.world.keyframes import Keyframe
+from geogs.world.edges import Pair
 
 ROUNDS = 12
 """Most rounds."""
@@ -52,6 +49,19 @@ Evidence = Sequence[tuple[list[int], VaryingEvidence]]
 """Keyframes that are solved together, and the evidence of their matches; the parts in order."""
 
 
+@dataclass(frozen=True)
+class FrameLenses:
+    """Per-frame intrinsics; true if they vary."""
+
+    each: Mapping[int, FrameLens] = field(default_factory=dict)
+    """Intrinsics by the indices of the located frames."""
+    prior: VaryingPrior | None = None
+    """Prior of the variation; None if they do not vary."""
+
+    def __bool__(self) -> bool:
+        return self.prior is not None
+
+
 def correct_frame_lenses(
     matches: KeyframeMatches, before: FrameLenses | None = None
 ) -> FrameLenses:
@@ -66,7 +76,7 @@ def correct_frame_lenses(
     ids = matches.tracker.segment.ids
     if not matches.measured or matches.tracker.segment.fixed:
         return before
-    kept = _State.of(matches)
+    restore = _saved(matches)
     intrinsics = _Intrinsics(matches, before)
     evidence = said_of_frame_lenses(matches.tracker, ids)
     if not before and not intrinsics.free_another(evidence):
@@ -80,38 +90,31 @@ def correct_frame_lenses(
             break
     most = AMBIGUOUS_ROWS if matches.log.rows else AMBIGUOUS
     if last > DIVERGED or intrinsics.left > most:
-        kept.restore(matches)
+        restore()
         return before
     found = intrinsics.found()
     shift_frames(matches.log, matches.keyframes, found.each)
     return found
 
 
-@dataclass(frozen=True)
-class _State:
-    """State changed by an adjustment."""
+def _saved(matches: KeyframeMatches) -> Callable[[], None]:
+    """Return a function that restores the present state."""
+    camera = matches.camera
+    edges = dict(matches.graph.edges)
+    corrections = dict(matches.corrections)
+    keyframes = [(k, k.T_cw.clone(), k.inverse_depth, k.information) for k in matches.keyframes]
 
-    camera: Camera
-    corrections: Mapping[str, Shifts]
-    edges: Mapping[Pair, Edge]
-    keyframes: Sequence[tuple[Keyframe, Tensor, Tensor, Tensor]]
-
-    @staticmethod
-    def of(matches: KeyframeMatches) -> "_State":
-        """Save the present state."""
-        each = [(k, k.T_cw.clone(), k.inverse_depth, k.information) for k in matches.keyframes]
-        edges, corrections = dict(matches.graph.edges), dict(matches.corrections)
-        return _State(matches.camera, corrections, edges, each)
-
-    def restore(self, matches: KeyframeMatches) -> None:
-        """Restore the saved state."""
-        matches.graph.see_by(self.camera)
-        matches.graph.replace(self.edges)
+    def restore() -> None:
+        matches.graph.see_by(camera)
+        matches.graph.replace(edges)
         matches.corrections.clear()
-        matches.corrections.update(self.corrections)
-        for keyframe, T_cw, depth, information in self.keyframes:
-            keyframe.T_cw, keyframe.inverse_depth = T_cw, depth
+        matches.corrections.update(corrections)
+        for keyframe, T_cw, depth, information in keyframes:
+            keyframe.T_cw = T_cw
+            keyframe.inverse_depth = depth
             keyframe.information = information
+
+    return restore
 
 
 class _Intrinsics:
@@ -121,11 +124,13 @@ class _Intrinsics:
         self.prior = before.prior or VaryingPrior()
         self.left = 0.0
         """Largest relative cost reduction by a fixed parameter, as estimated last."""
-        self._matches, self._keyframes = matches, matches.keyframes
+        self._matches = matches
+        self._keyframes = matches.keyframes
+        none = FrameLens()
         self._own = {
-            k.id: torch.tensor(before.each[k.frame_index].sizes, dtype=torch.float64)
-            for k in matches.keyframes if k.frame_index in before.each
-        }  # fmt: skip
+            k.id: torch.tensor(before.each.get(k.frame_index, none).sizes, dtype=torch.float64)
+            for k in matches.keyframes
+        }
         self._common = torch.zeros(SHAPES, dtype=torch.float64)
         """Total change of the camera."""
         deviation = self._keyframes.table.focal_deviation
@@ -138,13 +143,17 @@ class _Intrinsics:
         fixed = [change for change in LensChange if not self.prior.varies(change)]
         is_first = len(fixed) == len(LensChange)
         now = 0.0 if is_first else max(0.0, self._estimated(evidence, self.prior)[2])
-        most, best, self.left = now + EXPLAINED, self.prior, 0.0
+        most = now + EXPLAINED
+        best = self.prior
+        self.left = 0.0
         for prior in map(self.prior.also, fixed):
             explained = self._estimated(evidence, prior)[2]
             if explained >= most:
-                most, best = explained, prior
+                most = explained
+                best = prior
             self.left = max(self.left, explained - now)
-        is_freed, self.prior = best is not self.prior, best
+        is_freed = best is not self.prior
+        self.prior = best
         return is_freed
 
     def step(self, evidence: Evidence) -> float:
@@ -157,7 +166,7 @@ class _Intrinsics:
             for (frames, _), step in zip(evidence, steps, strict=True)
             for k, size in zip(frames, step[:-SHAPES].reshape(-1, len(OWN)), strict=True)
         }
-        self._own.update({k: self._of(k) + size for k, size in own.items()})
+        self._own.update({k: self._own[k] + size for k, size in own.items()})
         if self._is_open:
             common = torch.stack([step[-SHAPES:] for step in steps]).mean(0)
             self._common = self._common + common
@@ -169,31 +178,31 @@ class _Intrinsics:
         self, evidence: Evidence, prior: VaryingPrior
     ) -> tuple[list[Tensor], VaryingPrior, float]:
         """Return steps of all parts, prior after EM, and the largest relative cost reduction."""
-        steps, explained = [], 0.0
+        steps = []
+        explained = 0.0
         for frames, part in evidence:
             times = [self._keyframes[k].timestamp for k in frames]
-            taken = torch.cat([*(self._of(k) for k in frames), self._common])
+            taken = torch.cat([*(self._own[k] for k in frames), self._common])
             at = torch.tensor(times, dtype=torch.float64)
             step, prior = part.told(at, taken, prior, self._shared)
             steps.append(step)
             explained = max(explained, part.explained(step))
         return steps, prior, explained
 
-    def _of(self, id: int) -> Float[Tensor, "3"]:
-        return self._own.get(id, torch.zeros(len(OWN), dtype=torch.float64))
-
     def shifts(self, part: list[Pair]) -> Float[Tensor, "e p 2"]:
         """Return shifts of the matches of some edges to those of the shared lens, in pixels."""
-        grid, keyframes = self._keyframes.grid, self._keyframes
-        T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
+        grid = self._keyframes.grid
+        keyframes = self._keyframes
+        T_ji = keyframes.relative_poses(part)
+        depth = keyframes.inverse_depths([i for i, _ in part])
         at = project(grid.camera, grid.rays, T_ji, depth)
-        both = torch.stack([torch.stack([self._of(k) for k in pair]) for pair in part])
+        both = torch.stack([torch.stack([self._own[k] for k in pair]) for pair in part])
         return shifts_of_own(grid.camera, grid.rays, T_ji, at, both.to(at.pixels))
 
     def found(self) -> FrameLenses:
         """Return the intrinsics of each frame."""
-        known = {k.frame_index: self._of(k.id) for k in self._keyframes}
+        known = {k.frame_index: self._own[k.id] for k in self._keyframes}
         sizes = sizes_of_frames(self._matches.log, self._keyframes, known, self.prior)
-        varies = torch.tensor(self.prior.jitter) > 0
+        varies = torch.tensor(self.prior.deviations[: len(OWN)]) > 0
         each = {n: FrameLens(*torch.where(varies, s, 0.0).tolist()) for n, s in sizes.items()}
         return FrameLenses(each, self.prior)

@@ -23,7 +23,7 @@ from geogs.bundle.uncertainty.lens_error import (
     LensEvidence,
     lens_prior,
 )
-from geogs.loop.camera.found import found_lens
+from geogs.geometry.camera import Camera
 from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, row_shifts
@@ -93,13 +93,20 @@ class _LensSearch:
     ) -> None:
         self.left = ROUNDS
         """Rounds left."""
-        self._matches, self._table, self._ends = matches, matches.keyframes.table, ends
-        self._before, self._readout, self._longer = before, readout, 0.0
+        self._matches = matches
+        self._table = matches.keyframes.table
+        self._ends = ends
+        self._before = before
+        self._readout = readout
+        self._longer = 0.0
         self._said: LensEstimate | None = None
         self._is_open = ends and self._table.focal_deviation > 0
         self._frees_focal = before.focal != 1 if before else self._is_open
         self._frees_centre = self._is_open and (before is None or before.is_off_centre)
-        self._rows = _rows_in_doubt(matches, readout) if ends else None
+        rows = row_errors(matches.log, matches.keyframes) if ends else None
+        if rows is not None:
+            rows = rows.with_readout(readout) if rows.doubt >= READOUT_DOUBT else None
+        self._rows = rows
 
     def step(self) -> bool:
         """Take a step; False without evidence, or with too little against a given lens."""
@@ -128,15 +135,11 @@ class _LensSearch:
         video agree on them."""
         if evidence.bend.evidence < EVIDENCE:
             return False
-        halves = self._halves()
-        return len(halves) == 2 and halves[0].agreement(halves[1]) >= AGREEMENT
-
-    def _halves(self) -> list[LensEvidence]:
-        """Return the evidence of each half of the video alone, where there is any."""
         ids = list(self._matches.free_depth)
-        halves = ids[: len(ids) // 2 + 1], ids[len(ids) // 2 :]
-        found = (said_of_lens(self._matches.tracker, half, self._rows) for half in halves)
-        return [evidence for evidence in found if evidence is not None]
+        middle = len(ids) // 2
+        first = said_of_lens(self._matches.tracker, ids[: middle + 1], self._rows)
+        second = said_of_lens(self._matches.tracker, ids[middle:], self._rows)
+        return first is not None and second is not None and first.agreement(second) >= AGREEMENT
 
     @property
     def _moves(self) -> tuple[float, ...]:
@@ -154,7 +157,8 @@ class _LensSearch:
         if self._rows is not None:
             said = said.told(shapes, 1 - self._readout - self._longer, self._rows.doubt)
         if self._ends and not self._frees_focal and _contradict_focal(said):
-            self._frees_focal, self.left = True, ROUNDS
+            self._frees_focal = True
+            self.left = ROUNDS
         if self._frees_focal:
             return said.shortened(0, MOST_AT_ONCE)
         return evidence.bend if self._rows is None and not self._frees_centre else said.without(0)
@@ -163,7 +167,8 @@ class _LensSearch:
         """Restart with the principal point in the middle, unless it is significantly elsewhere."""
         found = said.size.new_tensor(self._moves[RADIAL:])
         if said.of(slice(RADIAL, SHAPES))._replace(size=found).evidence < CENTRE_EVIDENCE:
-            self._frees_centre, self.left = False, ROUNDS
+            self._frees_centre = False
+            self.left = ROUNDS
             given = self._table.camera
             self._matches.graph.see_by(replace(self._matches.camera, cx=given.cx, cy=given.cy))
 
@@ -176,7 +181,8 @@ class _LensSearch:
         """Return the lens with its deviations; None if nothing was estimated."""
         if self._said is None:
             return None
-        log, focal = self._matches.log, self._moves[0]
+        log = self._matches.log
+        focal = self._moves[0]
         deviation = self._said.deviation.tolist()
         if self._rows is not None:
             readout = self._readout + self._longer
@@ -194,11 +200,14 @@ class _LensSearch:
 
 def _contradict_focal(said: LensEstimate) -> bool:
     """Whether a given focal length is wrong by much more than its deviation."""
-    size, deviation = abs(float(said.size[0])), float(said.deviation[0])
+    size = abs(float(said.size[0]))
+    deviation = float(said.deviation[0])
     return size > FOCAL_EVIDENCE * deviation and STANDARD_ERRORS * deviation < FOCAL_DOUBT
 
 
-def _rows_in_doubt(matches: KeyframeMatches, readout: float) -> RowErrors | None:
-    """Return rows rectified with a readout of large deviation, if any."""
-    rows = row_errors(matches.log, matches.keyframes)
-    return None if rows is None or rows.doubt < READOUT_DOUBT else rows.with_readout(readout)
+def found_lens(given: Camera, found: Camera, said: FoundLens | None = None) -> FoundLens:
+    """Return the lens of an estimated camera relative to the ``given`` pinhole; deviations are
+    those in ``said``."""
+    focal, k1, k2, right, down = found.moves_from(given)
+    said = said or FoundLens(0.0, 0.0, 0.0, 0.0)
+    return replace(said, k1=k1, k2=k2, focal=math.exp(focal), right=right, down=down)

@@ -44,7 +44,10 @@ def correct_rows(matches: KeyframeMatches, finds_readout: bool = True) -> float:
     Matches of the frames between the keyframes are corrected, too. With ``finds_readout``, a
     readout estimated from the video is estimated again. Returns its ratio to the former readout.
     """
-    keyframes, log, search, last = matches.keyframes, matches.log, _Search(), ROUNDS - 1
+    keyframes = matches.keyframes
+    log = matches.log
+    search = _Search()
+    last = ROUNDS - 1
     matches.corrections.pop("readout", None)  # now included in the rows
     measured = matches.corrected(but="rows")
     for n in range(1 + READOUTS):
@@ -83,7 +86,8 @@ def let_lenses_move(matches: KeyframeMatches, lenses: Mapping[int, FrameLens]) -
     A stabilised lens moves all the time, while a crop is moved after an image was read. Matches are
     corrected for these lenses.
     """
-    keyframes, log = matches.keyframes, matches.log
+    keyframes = matches.keyframes
+    log = matches.log
     still = row_errors(log, keyframes) if lenses else None
     if still is None:
         return
@@ -119,10 +123,12 @@ def _readout_gradient(
     """Return half the derivative of the cost, including the prior, by the factor on the readout, at
     that of ``errors``."""
     total = (factor - 1) / errors.doubt**2
-    keyframes, huber = matches.keyframes, matches.options.huber
+    keyframes = matches.keyframes
+    huber = matches.options.huber
     grid = keyframes.grid
     for part, (shift, slope) in edge_shifts(errors, keyframes, measured):
-        T, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
+        T = keyframes.relative_poses(part)
+        depth = keyframes.inverse_depths([i for i, _ in part])
         pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
         weight = static_weight(keyframes, part, pixels, weight)
         p = project(grid.camera, grid.rays, T, depth)

@@ -25,19 +25,22 @@ def fetch_corners(image, us, vs, index, parts, corners):
     height, width = image.shape
     last_u, last_v = np.float32(width - 1), np.float32(height - 1)
     most_i, most_j = np.float32(width - 2), np.float32(height - 2)
-    fx, fy = parts[0], parts[1]
     for x in range(us.shape[0]):
         u, v = min(max(us[x], ZERO), last_u), min(max(vs[x], ZERO), last_v)
         i, j = min(np.floor(u), most_i), min(np.floor(v), most_j)
-        fx[x], fy[x] = u - i, v - j
+        parts[0, x] = u - i
+        parts[1, x] = v - j
         index[x] = np.uint32(np.int32(j) * np.int32(width) + np.int32(i))
-    flat, right, down = image.ravel(), np.uint32(1), np.uint32(width)
-    p, q, r, s = corners[0], corners[1], corners[2], corners[3]
+    flat = image.ravel()
+    right = np.uint32(1)
+    down = np.uint32(width)
     for x in range(us.shape[0]):
         k = index[x]
-        p[x], q[x] = flat[k], flat[k + right]
+        corners[0, x] = flat[k]
+        corners[1, x] = flat[k + right]
         k += down
-        r[x], s[x] = flat[k], flat[k + right]
+        corners[2, x] = flat[k]
+        corners[3, x] = flat[k + right]
 
 
 @njit(**PART)
@@ -47,44 +50,51 @@ def hide_line(depth, lenses, tolerance, geometry, places, index, parts, corners)
     hx, hy = lenses[1, 2], lenses[1, 3]
     zoom_u, zoom_v = lenses[2, 0] / lenses[1, 0], lenses[2, 1] / lenses[1, 1]
     cx, cy = lenses[2, 2], lenses[2, 3]
-    us, vs, zs = geometry[0], geometry[1], geometry[2]
-    s, t = places[0], places[1]
-    for x in range(us.shape[0]):
-        s[x], t[x] = (us[x] - hx) * zoom_u + cx, (vs[x] - hy) * zoom_v + cy
-    fetch_corners(depth, s, t, index, parts, corners)
-    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], parts[0], parts[1]
-    for x in range(us.shape[0]):
-        p, q, r, last = p0[x], q0[x], r0[x], s0[x]
-        upper, lower = p + (q - p) * fx[x], r + (last - r) * fx[x]
-        known = (p > ZERO) & (q > ZERO) & (r > ZERO) & (last > ZERO)
-        z = zs[x]
-        near = abs(z - upper - (lower - upper) * fy[x]) < tolerance * z
-        zs[x] = z if known & near else ZERO
+    for x in range(geometry.shape[1]):
+        places[0, x] = (geometry[0, x] - hx) * zoom_u + cx
+        places[1, x] = (geometry[1, x] - hy) * zoom_v + cy
+    fetch_corners(depth, places[0], places[1], index, parts, corners)
+    for x in range(geometry.shape[1]):
+        p = corners[0, x]
+        q = corners[1, x]
+        r = corners[2, x]
+        s = corners[3, x]
+        upper = p + (q - p) * parts[0, x]
+        lower = r + (s - r) * parts[0, x]
+        known = (p > ZERO) & (q > ZERO) & (r > ZERO) & (s > ZERO)
+        z = geometry[2, x]
+        near = abs(z - upper - (lower - upper) * parts[1, x]) < tolerance * z
+        geometry[2, x] = z if known & near else ZERO
 
 
 @njit(**PART)
 def sample_line(y, geometry, parts, corners, reference, warped, slope, mask):
     """Row ``y`` of the warped image, its slope by depth and its mask from the corners of its
     samples; ``corners[2:]`` receive the image's derivatives along x and y."""
-    zs, by_u, by_v = geometry[2], geometry[3], geometry[4]
-    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], parts[0], parts[1]
-    own, out, out_slope, out_mask = reference[y], warped[y], slope[y], mask[y]
-    for x in range(zs.shape[0]):
-        p, q, r, s = p0[x], q0[x], r0[x], s0[x]
-        upper, lower = p + (q - p) * fx[x], r + (s - r) * fx[x]
-        seen = zs[x] > ZERO
-        du = (q - p) * (ONE - fy[x]) + (s - r) * fy[x] if seen else ZERO
+    for x in range(geometry.shape[1]):
+        p = corners[0, x]
+        q = corners[1, x]
+        r = corners[2, x]
+        s = corners[3, x]
+        part = parts[1, x]
+        upper = p + (q - p) * parts[0, x]
+        lower = r + (s - r) * parts[0, x]
+        seen = geometry[2, x] > ZERO
+        du = (q - p) * (ONE - part) + (s - r) * part if seen else ZERO
         dv = lower - upper if seen else ZERO
-        out[x] = upper + (lower - upper) * fy[x] if seen else own[x]
-        out_mask[x] = ONE if seen else ZERO
-        out_slope[x] = du * by_u[x] + dv * by_v[x]
-        r0[x], s0[x] = du, dv
+        warped[y, x] = upper + (lower - upper) * part if seen else reference[y, x]
+        mask[y, x] = ONE if seen else ZERO
+        slope[y, x] = du * geometry[3, x] + dv * geometry[4, x]
+        corners[2, x] = du
+        corners[3, x] = dv
 
 
 @njit(**PART)
 def enlarge_line(depth, y, rows, row_part, columns, column_part, line, geometry):
     """Row ``y`` of the enlarged depth into ``geometry[5]``; 0 where a source pixel is unknown."""
-    i, k, f = rows[0, y], rows[1, y], row_part[y]
+    i = rows[0, y]
+    k = rows[1, y]
+    f = row_part[y]
     for x in range(depth.shape[1]):
         a, b = depth[i, x], depth[k, x]
         known = (a > ZERO) & (b > ZERO) & (a < HUGE) & (b < HUGE)
@@ -102,7 +112,10 @@ def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
     the target. ``geometry`` (6, w) receives u, v, z (0 where out of view), du/dd, dv/dd.
     """
     fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
-    gx, gy, hx, hy = lenses[1, 0], lenses[1, 1], lenses[1, 2], lenses[1, 3]
+    gx = lenses[1, 0]
+    gy = lenses[1, 1]
+    hx = lenses[1, 2]
+    hy = lenses[1, 3]
     ry = (np.float32(y) - cy) / fy
     bx, by, bz = T[0, 1] * ry + T[0, 2], T[1, 1] * ry + T[1, 2], T[2, 1] * ry + T[2, 2]
     for x in range(geometry.shape[1]):
@@ -115,7 +128,9 @@ def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
         px, py = (d * qx + T[0, 3]) * inverse, (d * qy + T[1, 3]) * inverse
         u, v = gx * px + hx, gy * py + hy
         inside = front & (u >= ZERO) & (v >= ZERO) & (u <= last_u) & (v <= last_v)
-        geometry[0, x], geometry[1, x], geometry[2, x] = u, v, z if inside else ZERO
+        geometry[0, x] = u
+        geometry[1, x] = v
+        geometry[2, x] = z if inside else ZERO
         geometry[3, x] = gx * (qx - px * qz) * inverse
         geometry[4, x] = gy * (qy - py * qz) * inverse
 
@@ -142,12 +157,15 @@ def warp_rows(
     """
     height, width = target.shape
     last_u, last_v = np.float32(width - 1), np.float32(height - 1)
-    occluded, with_extra = target_depth.shape[0] > 1, extra.shape[1] > 0
+    occluded = target_depth.shape[0] > 1
+    with_extra = extra.shape[1] > 0
     count = reference.shape[1]
     line = np.empty(depth.shape[1], np.float32)
     geometry = np.empty((6, count), np.float32)
-    index, places = np.empty(count, np.uint32), np.empty((2, count), np.float32)
-    parts, corners = np.empty((2, count), np.float32), np.empty((4, count), np.float32)
+    index = np.empty(count, np.uint32)
+    places = np.empty((2, count), np.float32)
+    parts = np.empty((2, count), np.float32)
+    corners = np.empty((4, count), np.float32)
     for y in range(first, last):
         total = ZERO
         enlarge_line(depth, y, rows, row_part, columns, column_part, line, geometry)
@@ -160,7 +178,8 @@ def warp_rows(
         sample_line(y, geometry, parts, corners, reference, warped, slope, mask)
         if with_extra:
             for x in range(count):
-                extra[0, y, x], extra[1, y, x] = corners[2, x], corners[3, x]
+                extra[0, y, x] = corners[2, x]
+                extra[1, y, x] = corners[3, x]
                 extra[2, y, x] = geometry[5, x]
         for x in range(reference.shape[1]):
             size = min(abs(warped[y, x] - reference[y, x]), settings.cut)
@@ -181,7 +200,8 @@ def correlate_rows(first, last, reference, texture, warped, mask, half, settings
     height, width = reference.shape
     side = 2 * half + 1
     norm = ONE / np.float32(side * side)
-    line, sums = np.empty((6, width), np.float32), np.empty((6, width), np.float32)
+    line = np.empty((6, width), np.float32)
+    sums = np.empty((6, width), np.float32)
     for y in range(first, last):
         for x in range(width):
             fields[0, y, x] = fields[1, y, x] = fields[2, y, x] = ZERO
@@ -262,7 +282,9 @@ def depth_gradient_rows(
     sums = np.zeros((3, width), np.float32)
     pull = np.zeros((last - first, width), np.float32)
     for y in range(height):
-        i, k, f = rows[0, y] - first, rows[1, y] - first, row_part[y]
+        i = rows[0, y] - first
+        k = rows[1, y] - first
+        f = row_part[y]
         own_i, own_k = 0 <= i < last - first, 0 <= k < last - first
         if not (own_i or own_k):
             continue
@@ -307,10 +329,13 @@ def pose_gradient_rows(first, last, g_image, extra, lenses, T, g_T):
             g_T[y, k] = 0.0
         for x in range(g_image.shape[2]):
             g = g_image[1, y, x]
-            du, dv, d = g * extra[0, y, x], g * extra[1, y, x], extra[2, y, x]
+            du = g * extra[0, y, x]
+            dv = g * extra[1, y, x]
+            d = extra[2, y, x]
             if du == ZERO and dv == ZERO:
                 continue
-            X, Y = d * (np.float32(x) - cx) / fx, d * (np.float32(y) - cy) / fy
+            X = d * (np.float32(x) - cx) / fx
+            Y = d * (np.float32(y) - cy) / fy
             inverse = ONE / (T[2, 0] * X + T[2, 1] * Y + T[2, 2] * d + T[2, 3])
             px = (T[0, 0] * X + T[0, 1] * Y + T[0, 2] * d + T[0, 3]) * inverse
             py = (T[1, 0] * X + T[1, 1] * Y + T[1, 2] * d + T[1, 3]) * inverse

@@ -33,11 +33,16 @@ def known_depth(depth, alpha, prior, y, min_alpha, clean, r):
 @njit(**PART)
 def pixel_terms(clean, r, alpha, spread, prior, confidence, y, settings, pull, g_alpha, g_spread):
     """Weighted sum of L_d, L_dist and the opacity terms over row ``y``, and its gradients."""
-    total, relative = ZERO, settings.relative > ZERO
+    total = ZERO
+    relative = settings.relative > ZERO
     for x in range(clean.shape[1]):
-        a, s, d, f = alpha[y, x], spread[y, x], clean[r, x], prior[y, x]
+        a = alpha[y, x]
+        s = spread[y, x]
+        d = clean[r, x]
+        f = prior[y, x]
         solid = abs(a) < HUGE
-        empty, filled = solid & (f < ZERO), solid & (f >= ZERO)
+        empty = solid & (f < ZERO)
+        filled = solid & (f >= ZERO)
         opaque = settings.opacity if filled else ZERO
         hollow = settings.silhouette if empty else ZERO
         total += opaque * (ONE - a) if filled else ZERO
@@ -57,7 +62,8 @@ def pixel_terms(clean, r, alpha, spread, prior, confidence, y, settings, pull, g
 @njit(**PART)
 def normal_terms(clean, r, normal, prior, y, settings, g_normal):
     """Weighted sum of L_n over row ``y``; adds to the normal's gradient."""
-    weight, epsilon = settings.normal, settings.normal_epsilon
+    weight = settings.normal
+    epsilon = settings.normal_epsilon
     total = ZERO
     for x in range(clean.shape[1]):
         ax, ay, az = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
@@ -69,7 +75,8 @@ def normal_terms(clean, r, normal, prior, y, settings, g_normal):
             ex, ey, ez = ax - fx, ay - fy, az - fz
             total += weight * (abs(ex) + abs(ey) + abs(ez))
             ex, ey, ez = np.sign(ex), np.sign(ey), np.sign(ez)
-            along, w = ex * ax + ey * ay + ez * az, weight * shrink
+            along = ex * ax + ey * ay + ez * az
+            w = weight * shrink
             g_normal[y, x, 0] += w * (ex - along * ax)
             g_normal[y, x, 1] += w * (ey - along * ay)
             g_normal[y, x, 2] += w * (ez - along * az)
@@ -79,12 +86,10 @@ def normal_terms(clean, r, normal, prior, y, settings, g_normal):
 @njit(**PART)
 def split_normals(normal, y, lines):
     """The coordinates of row ``y``'s normals as three rows; 0 where they are not finite."""
-    nx, ny, nz = lines[0], lines[1], lines[2]
-    for x in range(normal.shape[1]):
-        ax, ay, az = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
-        nx[x] = ax if abs(ax) < HUGE else ZERO
-        ny[x] = ay if abs(ay) < HUGE else ZERO
-        nz[x] = az if abs(az) < HUGE else ZERO
+    for k in range(3):
+        for x in range(normal.shape[1]):
+            value = normal[y, x, k]
+            lines[k, x] = value if abs(value) < HUGE else ZERO
 
 
 @njit(**PART)
@@ -96,17 +101,24 @@ def consistency_terms(clean, r, edge, y, settings, lines, push):
     where unknown.
     """
     fx, fy, cx, cy = settings.fx, settings.fy, settings.cx, settings.cy
-    weight, epsilon = settings.consistency, settings.normal_epsilon
-    ry, step_x, step_y = (np.float32(y) - cy) / fy, ONE / fx, ONE / fy
+    weight = settings.consistency
+    epsilon = settings.normal_epsilon
+    ry = (np.float32(y) - cy) / fy
+    step_x = ONE / fx
+    step_y = ONE / fy
     width = clean.shape[1]
     # Views from the first centre on, because an index that could be negative would keep the loop
     # from vectorising.
-    left, centre, right = clean[r, : width - 2], clean[r, 1 : width - 1], clean[r, 2:width]
+    left = clean[r, : width - 2]
+    centre = clean[r, 1 : width - 1]
+    right = clean[r, 2:width]
     above, below = clean[r - 1, 1 : width - 1], clean[r + 1, 1 : width - 1]
     nx, ny, nz = lines[0, 1 : width - 1], lines[1, 1 : width - 1], lines[2, 1 : width - 1]
     g_x, g_y, g_z = lines[3, 1 : width - 1], lines[4, 1 : width - 1], lines[5, 1 : width - 1]
-    to_left, to_right = push[0, 1 : width - 1], push[1, 1 : width - 1]
-    to_above, to_below = push[2, 1 : width - 1], push[3, 1 : width - 1]
+    to_left = push[0, 1 : width - 1]
+    to_right = push[1, 1 : width - 1]
+    to_above = push[2, 1 : width - 1]
+    to_below = push[3, 1 : width - 1]
     edges = edge[y, 1 : width - 1]
     total = ZERO
     for i in range(width - 2):
@@ -138,7 +150,8 @@ def consistency_terms(clean, r, edge, y, settings, lines, push):
         # Through k = h x v: d/dh = v x g, d/dv = g x h; then along the neighbours' rays.
         ux, uy, uz = vy * gz - vz * gy, vz * gx - vx * gz, vx * gy - vy * gx
         wx, wy, wz = gy * hz - gz * hy, gz * hx - gx * hz, gx * hy - gy * hx
-        across, down = rx * ux + ry * uy + uz, rx * wx + ry * wy + wz
+        across = rx * ux + ry * uy + uz
+        down = rx * wx + ry * wy + wz
         to_left[i] = step_x * ux - across
         to_right[i] = step_x * ux + across
         to_above[i] = down - step_y * wy
@@ -149,11 +162,9 @@ def consistency_terms(clean, r, edge, y, settings, lines, push):
 @njit(**PART)
 def add_normal_gradient(lines, y, g_normal):
     """Adds the gradients of row ``y``'s normals, which have none at the border."""
-    gx, gy, gz = lines[3], lines[4], lines[5]
     for x in range(1, g_normal.shape[1] - 1):
-        g_normal[y, x, 0] += gx[x]
-        g_normal[y, x, 1] += gy[x]
-        g_normal[y, x, 2] += gz[x]
+        for k in range(3):
+            g_normal[y, x, k] += lines[3 + k, x]
 
 
 @njit(**PART)
@@ -170,14 +181,19 @@ def add_consistency(pull, r, push):
 @njit(**PART)
 def smoothness_terms(clean, r, gradient, y, settings, scale, pull):
     """Weighted sum of L_ds over row ``y``; ``scale`` is 1 over the median depth."""
-    weight, eta, both = settings.smoothness, settings.eta, settings.rewards_edges
+    weight = settings.smoothness
+    eta = settings.eta
+    both = settings.rewards_edges
     total = ZERO
     for x in range(clean.shape[1] - 1):
         dc, dr, db = clean[r, x], clean[r, x + 1], clean[r + 1, x]
         if (dc > ZERO) & (dr > ZERO) & (db > ZERO):
-            across, down, contrast = dr - dc, db - dc, gradient[y, x]
+            across = dr - dc
+            down = db - dc
+            contrast = gradient[y, x]
             step = scale * (abs(across) + abs(down))
-            keep, reward = np.exp(-eta * contrast), both * contrast * np.exp(-eta * step)
+            keep = np.exp(-eta * contrast)
+            reward = both * contrast * np.exp(-eta * step)
             total += weight * (step * keep + reward)
             slope = weight * scale * (keep - eta * reward)
             gx, gy = slope * np.sign(across), slope * np.sign(down)
@@ -199,18 +215,21 @@ def single_view_rows(
     (3, rows, w) has at least 5 and last - first + 4 rows. ``loss[y]`` is the row's sum; ``scratch``
     and ``g_normal`` are 0 on entry.
     """
-    clean, pull, push = scratch[0], scratch[1], scratch[2]
+    clean = scratch[0]
+    pull = scratch[1]
+    push = scratch[2]
     low, high = max(first - 2, 0), min(last + 2, depth.shape[0])
     for y in range(low, high):
         known_depth(depth, alpha, prior, y, settings.min_alpha, clean, y - low)
     lines = np.zeros((6, depth.shape[1]), np.float32)
     for y in range(low, high):
-        r, own, total = y - low, first <= y < last, ZERO
+        r = y - low
+        own = first <= y < last
+        total = ZERO
         if own:
             total += pixel_terms(
-                clean, r, alpha, spread, prior, confidence, y, settings, pull, g_alpha,
-                g_spread,
-            )  # fmt: skip
+                clean, r, alpha, spread, prior, confidence, y, settings, pull, g_alpha, g_spread
+            )
             if settings.normal > ZERO and len(prior_normal) > 0:
                 total += normal_terms(clean, r, normal, prior_normal, y, settings, g_normal)
         if settings.consistency > ZERO and 0 < r < high - low - 1:

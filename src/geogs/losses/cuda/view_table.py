@@ -76,10 +76,6 @@ class ViewTable:
         size = (self.render.height, self.render.width)
         maps = torch.zeros(5, *size, device=self.device)
         planes = self._uploaded_photo(photo)
-        if planes.shape[1:] != (self.photo.height, self.photo.width):
-            raise ValueError(
-                f"the grey image has size {tuple(planes.shape[1:])}, not the photo camera's"
-            )
         self._maps.append(maps)
         self._normals.append(None)
         self._photos.append(planes)
@@ -107,7 +103,8 @@ class ViewTable:
         """Replace a keyframe's prior depth, confidence, prior normals and edges."""
         maps = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
         self._maps[slot][:4].copy_(self._upload(torch.stack([m.float() for m in maps])))
-        before, normal = self._normals[slot], view.prior_normal
+        before = self._normals[slot]
+        normal = view.prior_normal
         planes = None if normal is None else self._upload(normal.permute(2, 0, 1))
         if before is not None and planes is not None:
             before.copy_(planes)
@@ -139,20 +136,15 @@ class ViewTable:
         return to_device(tensor.float().contiguous(), self.device)
 
     def _point(self, slot: int) -> None:
-        """Write the addresses of a slot's maps."""
-        maps, normal = self._maps[slot], self._normals[slot]
-        address = dict.fromkeys(ViewField, 0)
-        for row, field in enumerate((ViewField.EDGE, ViewField.IMAGE_GRADIENT,
-                                     ViewField.PRIOR_DEPTH, ViewField.CONFIDENCE,
-                                     ViewField.RENDERED_DEPTH)):  # fmt: skip
-            address[field] = maps[row].data_ptr()
-        address[ViewField.PRIOR_NORMAL] = 0 if normal is None else normal.data_ptr()
-        *planes, texture = self._photos[slot]
-        address[ViewField.TEXTURE] = texture.data_ptr()
+        """Write the addresses of a slot's maps, in the order of ``ViewField``."""
+        edge, gradient, prior, confidence, rendered = (m.data_ptr() for m in self._maps[slot])
+        normal = self._normals[slot]
+        normals = 0 if normal is None else normal.data_ptr()
+        *planes, texture = (m.data_ptr() for m in self._photos[slot])
         for pointers, plane in zip(self.planes, planes, strict=True):
-            address[ViewField.GREY] = plane.data_ptr()
-            line = torch.tensor([address[field] for field in ViewField], dtype=torch.int64)
-            pointers[slot].copy_(to_device(line, self.device))
+            line = [edge, gradient, prior, confidence, normals, plane, texture, rendered]
+            addresses = torch.tensor(line, dtype=torch.int64)
+            pointers[slot].copy_(to_device(addresses, self.device))
 
     def _grow(self) -> None:
         """Double the capacity; the keyframes' maps stay where they are."""

@@ -54,8 +54,6 @@ class WindowLosses:
         pair_weight: float,
         with_pose: bool = False,
     ) -> None:
-        if not 0 < pair_weight <= 1:
-            raise ValueError(f"the weight of a pair is in (0, 1], not {pair_weight}")
         self.table = table
         self.config = config
         self.views = views
@@ -71,27 +69,25 @@ class WindowLosses:
             for k, c in compared_planes(config)
         ]
         """Planes of the photometric images with their weights."""
-        self._allocate()
-
-    def _uploaded(self, settings: tuple[float | bool, ...]) -> Float32[Tensor, "k"]:
-        return torch.tensor(settings, dtype=torch.float32, device=self.table.device)
-
-    def _allocate(self) -> None:
-        device, render, photo = self.table.device, self.table.render, self.table.photo
-        pairs, c = self.views * self.partners, self.config
+        device = table.device
+        pairs = views * partners
 
         def maps(*shape: int) -> Float32[Tensor, "..."]:
             return torch.zeros(shape, dtype=torch.float32, device=device)
 
-        self._clean = maps(self.views, render.height, render.width)
-        self._inverse_median = maps(self.views)
+        self._clean = maps(views, table.render.height, table.render.width)
+        self._inverse_median = maps(views)
         self._motions = maps(pairs, 12)
         self._targets = torch.full((pairs,), -1, dtype=torch.int32, device=device)
-        size = (pairs if self._photo else 0, photo.height, photo.width)
-        self._warped, self._pull = maps(*size), maps(*size)
-        two_measures = c.ssim_weight > 0 and c.ncc_weight > 0 and not c.colour
-        keeps_gradient = self._photo and (self._with_pose or two_measures)
+        size = (pairs if self._photo else 0, table.photo.height, table.photo.width)
+        self._warped = maps(*size)
+        self._pull = maps(*size)
+        two_measures = config.ssim_weight > 0 and config.ncc_weight > 0 and not config.colour
+        keeps_gradient = self._photo and (with_pose or two_measures)
         self._image_gradient = maps(*size) if keeps_gradient else None
+
+    def _uploaded(self, settings: tuple[float | bool, ...]) -> Float32[Tensor, "k"]:
+        return torch.tensor(settings, dtype=torch.float32, device=self.table.device)
 
     def launch(
         self,
@@ -117,19 +113,20 @@ class WindowLosses:
         contiguous.
         """
         assert (relative_gradient is not None) == self._with_pose
-        t, kernels, c = self.table, self._kernels, self.config
+        t = self.table
+        kernels = self._kernels
+        c = self.config
         height, width = t.render.height, t.render.width
-        views, partners = self.views, self.partners
+        views = self.views
+        partners = self.partners
         kernels["begin_window"](
             _blocks(max(views * partners, views), 128), 128, batch, pairs, t.poses,
             self._photo_settings, self._targets, self._motions, loss, relative_gradient,
             views, partners,
         )  # fmt: skip
         if c.smoothness_weight > 0:
-            kernels["inverse_median"](
-                views, 1024, batch, t.pointers, depth, alpha, self._inverse_median,
-                height * width, MIN_ALPHA,
-            )  # fmt: skip
+            maps = (batch, t.pointers, depth, alpha, self._inverse_median)
+            kernels["inverse_median"](views, 1024, *maps, height * width, MIN_ALPHA)
         kernels["single_view"](
             (_blocks(width, 32), _blocks(height, 16), views), 256, batch, t.pointers,
             self._view_settings, depth, normal, alpha, distortion, self._inverse_median,
@@ -151,7 +148,8 @@ class WindowLosses:
         relative_gradient: Float64[Tensor, "b p 12"] | None,
     ) -> None:
         """Adds the multi-view terms of a plane, given the visible depth and the pairs' motions."""
-        t, kernels = self.table, self._kernels
+        t = self.table
+        kernels = self._kernels
         pairs = self.views * self.partners
         height, width = t.photo.height, t.photo.width
         sizes = (t.render.height, t.render.width, height, width, self.partners)
@@ -162,43 +160,31 @@ class WindowLosses:
             self._motions, pointers, t.rendered, t.deviations, settings, self._clean, self._warped,
             self._pull, self._image_gradient, loss, *sizes, not windowed,
         )  # fmt: skip
+
+        def compare(kernel: str, half: int, flags: _Flags) -> None:
+            """Launch a measure of windows that reach ``half`` pixels to each side."""
+            grid = (_blocks(width, _STRIP - 4 * half), _blocks(height, _STRIP_ROWS), pairs)
+            kernels[kernel](
+                grid, _STRIP, batch, self._targets, pointers, t.deviations, settings, self._warped,
+                self._pull, self._image_gradient, loss, height, width, self.partners, _STRIP_ROWS,
+                int(flags),
+            )  # fmt: skip
+
         keep = _Flags.KEEP_GRADIENT if self._with_pose else _Flags(0)
         if c.ssim_weight > 0:
             flags = _Flags(0) if c.ncc_weight > 0 else _Flags.FINISH | keep
-            self._compare("compare_structure", _SSIM_HALF, pointers, settings, batch, loss, flags)
+            compare("compare_structure", _SSIM_HALF, flags)
         if c.ncc_weight > 0:
             earlier = _Flags.ADD_EARLIER if c.ssim_weight > 0 else _Flags(0)
             flags = earlier | _Flags.FINISH | keep
-            kernel, half = f"correlate_{c.ncc_patch}", c.ncc_patch // 2
-            self._compare(kernel, half, pointers, settings, batch, loss, flags)
+            compare(f"correlate_{c.ncc_patch}", c.ncc_patch // 2, flags)
         if relative_gradient is not None:
-            kernels["motion_gradient"](
-                (columns, _blocks(height, _MOTION_ROWS), pairs), (32, 8), self._targets,
-                self._motions, pointers, settings, self._clean, self._warped,
-                self._image_gradient, relative_gradient, *sizes,
-            )  # fmt: skip
+            grid = (columns, _blocks(height, _MOTION_ROWS), pairs)
+            given = (self._targets, self._motions, pointers, settings)
+            maps = (self._clean, self._warped, self._image_gradient)
+            kernels["motion_gradient"](grid, (32, 8), *given, *maps, relative_gradient, *sizes)
         grid = (_blocks(t.render.width, 32), _blocks(t.render.height, 8), self.views)
         kernels["gather_depth_gradient"](grid, (32, 8), self._targets, self._pull, d_depth, *sizes)
-
-    def _compare(
-        self,
-        kernel: str,
-        half: int,
-        pointers: Int64[Tensor, "slots fields"],
-        settings: Float32[Tensor, "k"],
-        batch: Int32[Tensor, "b"],
-        loss: Float32[Tensor, "b"],
-        flags: _Flags,
-    ) -> None:
-        photo = self.table.photo
-        strips = _blocks(photo.width, _STRIP - 4 * half)
-        grid = (strips, _blocks(photo.height, _STRIP_ROWS), self.views * self.partners)
-        self._kernels[kernel](
-            grid, _STRIP, batch, self._targets, pointers, self.table.deviations, settings,
-            self._warped, self._pull,
-            self._image_gradient, loss, photo.height, photo.width,
-            self.partners, _STRIP_ROWS, int(flags),
-        )  # fmt: skip
 
     def store_rendered(
         self,
@@ -211,10 +197,10 @@ class WindowLosses:
         If a slot comes twice, one of its depths is kept.
         """
         pixels = depth.shape[1] * depth.shape[2]
-        self._kernels["store_rendered"](
-            (_blocks(pixels, 256), len(batch)), 256, batch, self.table.pointers,
-            self.table.rendered, depth, alpha, pixels, MIN_ALPHA,
-        )  # fmt: skip
+        grid = (_blocks(pixels, 256), len(batch))
+        stored = (self.table.pointers, self.table.rendered)
+        maps = (depth, alpha)
+        self._kernels["store_rendered"](grid, 256, batch, *stored, *maps, pixels, MIN_ALPHA)
 
 
 def _blocks(size: int, block: int) -> int:

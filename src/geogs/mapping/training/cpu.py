@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.cpu.fused import fused_multi_view, fused_single_view
 from geogs.losses.multi_view import enlarge_depth
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import MapView
@@ -87,17 +87,16 @@ class CpuTrainer:
         """``COARSE_PART``, or 0 if renderings are too small for that."""
 
     def train(
-        self,
-        batches: Sequence[Batch],
-        factors: Sequence[float] | None = None,
-        coarse: bool = False,
+        self, batches: Sequence[Batch], factors: Sequence[float] | None = None, coarse: bool = False
     ) -> None:
         """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
 
         At half the resolution if ``coarse``, which needs a ``coarse_part``. If the views can only
         see an excerpt of the map, only that is trained, which changes nothing but rounding.
         """
-        whole, optimizer, seen = self.disks, self.optimizer, self._in_view(batches)
+        whole = self.disks
+        optimizer = self.optimizer
+        seen = self._in_view(batches)
         if not 0 < len(seen) <= _LARGE_EXCERPT * len(whole):
             self._train(batches, factors, coarse)
             return
@@ -107,7 +106,8 @@ class CpuTrainer:
             self.optimizer = MapOptimizer(part, optimizer.learning_rates)
             self._train(batches, factors, coarse)
         finally:
-            self.disks, self.optimizer = whole, optimizer
+            self.disks = whole
+            self.optimizer = optimizer
             whole.take_back(seen, part)
 
     def _train(
@@ -127,7 +127,8 @@ class CpuTrainer:
         if not views or not len(self.disks):
             return torch.zeros(0, dtype=torch.int64)
         steps = 1.5 * len(batches)  # Adam's moves are about as long as the learning rate
-        growth, way = np.exp(steps * LR_SCALE), steps * self.config.lr_position
+        growth = np.exp(steps * LR_SCALE)
+        way = steps * self.config.lr_position
         radius = REACH * growth * self.disks.scale.amax(1) + way * self.unit
         poses = torch.stack([view.T_cw for view in views.values()])
         camera = self.cameras.render

@@ -40,16 +40,21 @@ class FullTraining:
         growth: DiskGrowth,
         config: MappingConfig,
     ) -> None:
-        self._table, self._views, self._trainer = table, views, trainer
-        self._growth, self._config = growth, config
+        self._table = table
+        self._views = views
+        self._trainer = trainer
+        self._growth = growth
+        self._config = config
         self._mapped = [views[i] for i in table.mapped]
 
     def run(self, total: int, progress: Progress, until: float | None) -> None:
         """Continue from the table's ``place`` to ``total`` steps, or to a time of
         ``time.perf_counter``; rates fall with the steps or the time, whichever is nearer its end.
         """
-        table, config = self._table, self._config
-        begin, seconds_to_prune = time.perf_counter() - table.place.seconds, 0.0
+        table = self._table
+        config = self._config
+        begin = time.perf_counter() - table.place.seconds
+        seconds_to_prune = 0.0
         prunes = max(total // 4, 1)
         fills = {total // 3, 2 * total // 3} if config.ablation.start == "depths" else set()
         coarse = int(self._trainer.coarse_part * total)

@@ -38,7 +38,8 @@ def draw_views(
     ``views_per_step`` 0 every step has the whole window and its history, as the paper sums them;
     otherwise that many of them at random, the newest in every third step.
     """
-    window, older = mapped[-config.window :], mapped[: -config.window]
+    window = mapped[-config.window :]
+    older = mapped[: -config.window]
     drawn = min(HISTORY, len(older))
     history = [older[i] for i in random.choice(len(older), drawn, replace=False)] if drawn else []
     pool = window + history

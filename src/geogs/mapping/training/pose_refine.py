@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
-from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.cpu.fused import fused_multi_view, fused_single_view
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
@@ -26,7 +26,8 @@ class TangentAdam:
     """
 
     def __init__(self, parameter: Tensor, rate: float) -> None:
-        self.parameter, self.rate = parameter, rate
+        self.parameter = parameter
+        self.rate = rate
         self._first, self._second = torch.zeros_like(parameter), torch.zeros_like(parameter)
         self._steps = 0
 
@@ -56,12 +57,14 @@ def descend(
     tangent = torch.zeros(len(start) - 1, 6, dtype=torch.float64, requires_grad=True)
     units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
     optimizer = TangentAdam(tangent, config.pose_lr)
-    best_loss, best = float("inf"), start
+    best_loss = float("inf")
+    best = start
     for step in range(config.pose_iterations + 1):
         poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
         loss, differentiable = evaluate(poses)
         if loss < best_loss:
-            best_loss, best = loss, poses.detach()
+            best_loss = loss
+            best = poses.detach()
         if step < config.pose_iterations:
             optimizer.step(torch.autograd.grad(differentiable, tangent)[0])
     return best
@@ -80,40 +83,28 @@ def refine_poses(
     By :func:`descend` on L_d + L_n + L_mv with the mapping weights.
     """
     frozen = DiskParameters(*(p.detach() for p in disks.parameters))
+    losses = config.pose_loss
 
     def evaluate(poses: Float[Tensor, "k 4 4"]) -> tuple[float, Float[Tensor, ""]]:
-        loss = _pose_loss(frozen, active, views, poses, cameras, config, unit)
-        return float(loss.detach()), loss
+        """Sum over active views of L_d + L_n and of L_mv with their best partner."""
+        pose_of = {view.id: T for view, T in zip(active, poses, strict=True)}
+        total = poses.new_zeros(())
+        for view in active:
+            T_cw = pose_of[view.id]
+            output = render(frozen, cameras.render, T_cw)
+            alpha = output.alpha.detach()
+            spread = output.distortion.detach()
+            total = total + fused_single_view(
+                output.depth, output.normal, alpha, spread, view.constants, losses, unit
+            )
+            depth = output.shown_depth(MIN_ALPHA)
+            for i in view.row.partners[:1]:
+                other = views[i]
+                target = other.photo.at(pose_of.get(i, other.T_cw))
+                total = total + fused_multi_view(
+                    depth, view.photo.at(T_cw), target, other.rendered_depth, losses
+                )
+        return float(total.detach()), total
 
     best = descend(torch.stack([view.T_cw for view in active]), config, unit, evaluate)
     return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
-
-
-def _pose_loss(
-    disks: DiskParameters,
-    active: list[MapView],
-    views: Mapping[int, MapView],
-    poses: Float[Tensor, "k 4 4"],
-    cameras: MapCameras,
-    config: MappingConfig,
-    unit: float,
-) -> Float[Tensor, ""]:
-    """Sum over active views of L_d + L_n and of L_mv with their best partner."""
-    pose_of = {view.id: T for view, T in zip(active, poses, strict=True)}
-    loss_config = config.pose_loss
-    total = poses.new_zeros(())
-    for view in active:
-        T_cw = pose_of[view.id]
-        output = render(disks, cameras.render, T_cw)
-        total = total + fused_single_view(
-            output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
-            view.constants, loss_config, unit,
-        )  # fmt: skip
-        depth = output.shown_depth(MIN_ALPHA)
-        for i in view.row.partners[:1]:
-            other = views[i]
-            target = other.photo.at(pose_of.get(i, other.T_cw))
-            total = total + fused_multi_view(
-                depth, view.photo.at(T_cw), target, other.rendered_depth, loss_config
-            )
-    return total

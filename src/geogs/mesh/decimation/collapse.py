@@ -34,7 +34,8 @@ class CollapsingMesh:
 
     def __init__(self, vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> None:
         """``vertices`` in map units; ``faces`` of int32. Neither is changed."""
-        device, count = vertices.device, len(vertices)
+        device = vertices.device
+        count = len(vertices)
         self.became = torch.arange(count, device=device)
         """Current vertex of each original one, -1 if it has no face."""
         self.position = vertices.double()
@@ -81,13 +82,16 @@ class CollapsingMesh:
         """Mean of the known values of the original vertices merged into each current one, and
         whether there are any."""
         known = known & (self.became >= 0)
-        index, count = self.became[known], len(self.position)
+        index = self.became[known]
+        count = len(self.position)
         total = values.new_zeros(count, values.shape[1]).index_add_(0, index, values[known])
         number = torch.bincount(index, minlength=count)
         return total / number.clamp(min=1)[:, None], number > 0
 
     def _round(self) -> None:
-        corners, count, rings = self._corners, len(self.position), self._rings()
+        corners = self._corners
+        count = len(self.position)
+        rings = self._rings()
         best = torch.empty(count, dtype=torch.int64, device=corners.device)
         matched = torch.empty_like(best)
         self._over(count, "best_edges", *rings, self._cost, self._limit(), best)
@@ -107,9 +111,10 @@ class CollapsingMesh:
 
     def _squeeze(self) -> None:
         """Remove faces of which two corners were merged."""
-        corners, cost = self._corners, self._cost
+        corners = self._corners
+        cost = self._cost
         if corners.device.type == "cpu":
-            from geogs.mesh.decimation.collapse_kernels import squeeze
+            from geogs.mesh.decimation.decimation_kernels import squeeze
 
             left = torch.empty_like(corners), torch.empty_like(cost)
             count = squeeze(*(x.numpy() for x in (corners, cost, *left)))
@@ -130,7 +135,8 @@ class CollapsingMesh:
         now = number[root]
         self.became = torch.where(self.became >= 0, now[self.became], -1)
         self._corners = number[self._corners.long()].to(torch.int32)
-        self.position, self._quadric = self.position[used], self._quadric[used]
+        self.position = self.position[used]
+        self._quadric = self._quadric[used]
         self._fixed = self._fixed[used]
         self._parent = torch.arange(len(self.position), dtype=torch.int32, device=root.device)
 
@@ -141,7 +147,7 @@ class CollapsingMesh:
         """
         count = len(self.position)
         if self._corners.device.type == "cpu":
-            from geogs.mesh.decimation.collapse_kernels import rings
+            from geogs.mesh.decimation.decimation_kernels import rings
 
             first, corners = rings(self._corners.numpy(), count)
             return torch.from_numpy(first), torch.from_numpy(corners)
@@ -155,9 +161,9 @@ class CollapsingMesh:
             kernel = kernels_for(_SOURCE, self._corners.device)[name]
             kernel(-(-count // _THREADS), _THREADS, count, *arrays)
             return
-        from geogs.mesh.decimation import collapse_kernels
+        from geogs.mesh.decimation import decimation_kernels
 
-        loop, given = getattr(collapse_kernels, name), [array.numpy() for array in arrays]
+        loop, given = getattr(decimation_kernels, name), [array.numpy() for array in arrays]
         run_chunks(
             lambda n: loop(n * _SPAN, min((n + 1) * _SPAN, count), *given),
             -(-count // _SPAN),

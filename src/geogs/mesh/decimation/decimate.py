@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from geogs.geometry.neighbors import nearest_neighbors
 from geogs.mesh.clean import remove_degenerate_faces
 from geogs.mesh.decimation.collapse import CollapsingMesh
-from geogs.mesh.decimation.deviation import device_deviations, host_deviations
 from geogs.mesh.denoise import denoised
 from geogs.mesh.triangle_mesh import Mesh
+from geogs.threads import worker_count
 
 QUANTILE = 0.99
 """Fraction of the vertices that must lie within the tolerance of the decimated surface."""
@@ -19,6 +20,9 @@ MEAN_FRACTION = 0.15
 """Largest mean distance of the vertices, as a fraction of the tolerance: else a smooth surface
 becomes facets that are as far away as allowed."""
 _SAMPLES = 10_000
+"""Most vertices whose distances are computed."""
+_NEAREST_VERTICES = 3
+"""Vertices around a point whose faces are tested."""
 _BOUNDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 1.0)
 """Successive bounds of the edges' costs, as fractions of the tolerance."""
 _WORTH_A_LOOK = 0.98
@@ -58,7 +62,8 @@ def merged(
     if tolerance <= 0 or len(faces) < _FEWEST:
         return None
     allowed = np.array([tolerance, MEAN_FRACTION * tolerance])
-    found, mesh = None, CollapsingMesh(vertices, faces)
+    found = None
+    mesh = CollapsingMesh(vertices, faces)
     for bound in _BOUNDS:
         mesh = mesh.reduced(bound * tolerance)
         if len(mesh.faces) > _WORTH_A_LOOK * len(faces if found is None else found.faces):
@@ -72,13 +77,77 @@ def merged(
 def _deviation(mesh: CollapsingMesh, before: Float[Tensor, "n 3"]) -> Float[np.ndarray, "2"]:
     """Distance of the original vertices to a mesh: the ``QUANTILE`` and the mean."""
     step = 1 + len(before) // _SAMPLES
-    samples, became = before[::step], mesh.became[::step].clamp(min=0)
+    samples = before[::step]
+    became = mesh.became[::step].clamp(min=0)
     arrays = samples, mesh.position.float(), mesh.faces, became
     if samples.device.type == "cpu":
         away = host_deviations(*(array.numpy() for array in arrays))
     else:
         away = device_deviations(*arrays).cpu().numpy()
     return np.array([np.quantile(away, QUANTILE), away.mean()])
+
+
+def host_deviations(
+    points: Float[np.ndarray, "k 3"],
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    known: Int[np.ndarray, "k"],
+) -> Float[np.ndarray, "k"]:
+    """Distance of each point to the nearest face of those around the vertices nearest to it, and
+    around one that is known to be near; every vertex has a face.
+
+    It is the distance to the mesh, or a little more where faces differ much in size.
+    """
+    from scipy.spatial import cKDTree
+
+    from geogs.mesh.decimation.decimation_kernels import nearest_faces, rings
+
+    # For a single query most of the time would go into balancing the tree.
+    tree = cKDTree(vertices, balanced_tree=False, compact_nodes=False)
+    _, near = tree.query(points, k=_NEAREST_VERTICES, workers=worker_count())
+    near = np.column_stack([near, known])
+    first, corners = rings(faces.ravel(), len(vertices))
+    triangles = vertices.astype(np.float64)[faces]
+    return nearest_faces(points.astype(np.float64), near, first, corners // 3, triangles)
+
+
+def device_deviations(
+    points: Float[Tensor, "k 3"],
+    vertices: Float[Tensor, "n 3"],
+    faces: Int[Tensor, "m 3"],
+    known: Int[Tensor, "k"],
+) -> Float[Tensor, "k"]:
+    """:func:`host_deviations` on any device."""
+    _, near = nearest_neighbors(points, vertices, _NEAREST_VERTICES)
+    near = torch.cat([near, known[:, None]], 1)
+    vertex, corners = faces.flatten().sort(stable=True)
+    first = torch.searchsorted(vertex, near.flatten().to(vertex.dtype))
+    count = torch.searchsorted(vertex, near.flatten().to(vertex.dtype), right=True) - first
+    pair = torch.arange(len(count), device=faces.device).repeat_interleave(count)
+    number = torch.arange(len(pair), device=faces.device) - (count.cumsum(0) - count)[pair]
+    face = corners[first[pair] + number] // 3
+    point = pair // near.shape[1]
+    triangles = vertices.double()[faces[face].long()]
+    away = triangle_distances(points.double()[point], triangles)
+    return away.new_full((len(points),), torch.inf).scatter_reduce(0, point, away, "amin")
+
+
+def triangle_distances(
+    points: Float[Tensor, "k 3"], triangles: Float[Tensor, "k 3 3"]
+) -> Float[Tensor, "k"]:
+    """Distance of each point to a triangle of its own (its corners in rows)."""
+    edges = triangles.roll(-1, 1) - triangles
+    normal = torch.linalg.cross(edges[:, 0], -edges[:, 2])
+    length = normal.norm(dim=-1)
+    offset = points[:, None] - triangles
+    turn = (torch.linalg.cross(edges, offset) * normal[:, None]).sum(-1)
+    inside = (turn >= 0).all(-1) & (length > 0)
+    squared = edges.square().sum(-1)
+    fraction = (offset * edges).sum(-1) / torch.where(squared > 0, squared, 1.0)
+    foot = fraction.clamp(0, 1)[..., None] * edges
+    to_edges = (offset - foot).norm(dim=-1).amin(-1)
+    to_plane = (offset[:, 0] * normal).sum(-1).abs() / torch.where(length > 0, length, 1.0)
+    return torch.where(inside, to_plane, to_edges)
 
 
 def with_at_most(mesh: Mesh, faces: int) -> Mesh:

@@ -1,17 +1,20 @@
 """The image of a textured mesh: patches side by side, their exposures compensated."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
-from geogs.mesh.texture.atlas_kernels import draw_triangles
-from geogs.mesh.texture.packing import scale_that_fits
+from geogs.errors import InputError
+from geogs.mesh.colour_kernels import draw_triangles
 from geogs.mesh.texture.patches import Patches
 from geogs.mesh.triangle_mesh import DepthMapView
 
+STEP = 64
+"""Sides of an atlas are multiples of it, pixels."""
 SWATCH = 3
 """Side of a square of plain colour, for faces that no view shows, pixels."""
 
@@ -95,3 +98,60 @@ def _patch(
     drawn[outside] = spread[outside] / np.maximum(fraction[outside], 1e-6)[:, None]
     compensated = crop.astype(np.float32) * gains[view] + drawn
     return (compensated + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def pack(
+    sizes: Int64[np.ndarray, "n 2"], limit: int
+) -> tuple[Int64[np.ndarray, "n 2"], tuple[int, int]] | None:
+    """Left upper corners of rectangles, and width and height of an atlas that holds them all.
+
+    Rectangles stand on shelves, tall ones first. None where they do not fit into ``limit`` pixels
+    a side.
+    """
+    if not len(sizes):
+        return np.zeros((0, 2), np.int64), (STEP, STEP)
+    area = float(sizes.prod(1).sum())
+    width = max(int(sizes[:, 0].max()), math.ceil(1.05 * math.sqrt(area)))
+    width = min(_rounded(width), limit)
+    if int(sizes[:, 0].max()) > width:
+        return None
+    places = np.zeros_like(sizes)
+    x = y = shelf = 0
+    for number in np.lexsort((-sizes[:, 0], -sizes[:, 1])):
+        w, h = sizes[number].tolist()
+        if x + w > width:
+            x = 0
+            y = y + shelf
+            shelf = 0
+        places[number] = x, y
+        x = x + w
+        shelf = max(shelf, h)
+    height = _rounded(y + shelf)
+    return (places, (width, height)) if height <= limit else None
+
+
+def scale_that_fits(
+    sizes: Int64[np.ndarray, "n 2"], limit: int, fixed: int
+) -> tuple[Int64[np.ndarray, "n 2"], Int64[np.ndarray, "n 2"], tuple[int, int]]:
+    """Sizes scaled alike, at most by 1, so that they fit; their positions; the size of the atlas.
+
+    The last ``fixed`` rectangles keep their size.
+
+    Raises:
+        InputError: there is no room even for a pixel of each.
+    """
+    scale = 1.0
+    while scale > 1e-3:
+        scaled = np.maximum(np.round(sizes * scale), 1).astype(np.int64)
+        scaled[len(sizes) - fixed :] = sizes[len(sizes) - fixed :]
+        packed = pack(scaled, limit)
+        if packed is not None:
+            return scaled, *packed
+        scale *= 0.95
+    raise InputError(
+        f"A texture of {limit} pixels has no room for the surface; give a larger --texture-size."
+    )
+
+
+def _rounded(length: int) -> int:
+    return STEP * math.ceil(max(length, 1) / STEP)

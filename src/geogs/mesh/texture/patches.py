@@ -8,7 +8,7 @@ import scipy.sparse as sparse
 from jaxtyping import Float64, Int32, Int64
 from scipy.sparse.csgraph import connected_components
 
-from geogs.mesh.texture.candidates import image_pixels
+from geogs.mesh.texture.face_views import image_pixels
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 PADDING = 2
@@ -54,7 +54,8 @@ def cut_patches(
     seen = np.flatnonzero(label >= 0)
     _, patch = np.unique(component[seen], return_inverse=True)
     order = np.argsort(patch, kind="stable")
-    faces, patch = seen[order], patch[order]
+    faces = seen[order]
+    patch = patch[order]
     number = int(patch[-1]) + 1 if len(patch) else 0
     start = np.searchsorted(patch, np.arange(number + 1))
     view = label[faces[start[:-1]]].astype(np.int64)

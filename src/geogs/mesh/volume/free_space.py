@@ -46,22 +46,13 @@ class FreeSpace:
         """Whether the voxel nearest to each point is free; false if there is none."""
         if not len(self.keys) or not len(points):
             return np.zeros(len(points), bool)
-        block, inner, is_within = _nearest(points, self.voxel)
-        keys = pack(torch.from_numpy(block)).numpy()
+        voxel = np.rint(points / self.voxel).astype(np.int64)
+        block = np.floor_divide(voxel, BLOCK)
+        limit = LIMIT // BLOCK  # the range of pack
+        keys = pack(torch.from_numpy(block.clip(-limit, limit))).numpy()
         place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
-        known = (self.keys[place] == keys) & is_within
-        x, y, z = inner.T
+        known = (self.keys[place] == keys) & (np.abs(voxel) < LIMIT).all(axis=1)
+        x, y, z = (voxel - block * BLOCK).T
         number = (x * BLOCK + y) * BLOCK + z
         bit = self.bits[place, number >> 3] >> (7 - (number & 7)) & 1
         return known & (bit == 1)
-
-
-def _nearest(
-    points: Float[np.ndarray, "n 3"], size: float
-) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """Block of the voxel nearest to each point, clipped to the range of ``pack``, the voxel's
-    position in the block, and whether it is within a volume's reach."""
-    voxel, limit = np.rint(points / size).astype(np.int64), LIMIT // BLOCK
-    block = np.floor_divide(voxel, BLOCK)
-    is_within = np.asarray((np.abs(voxel) < LIMIT).all(axis=1))
-    return block.clip(-limit, limit), voxel - block * BLOCK, is_within

@@ -93,7 +93,9 @@ class PixelPlanes:
         A pixel of a surface that faces the camera has one; one at a slant has more, up to 64, along
         the direction in which its depth changes most.
         """
-        valid, camera, device = self.valid, self.camera, self.inverse.device
+        valid = self.valid
+        camera = self.camera
+        device = self.inverse.device
         steepest = torch.maximum(*(slope.abs() for slope in self.slant))
         length = steepest / self.inverse.square()
         count = (length / (spacing * self.growth)).ceil().clamp(1, _MOST_SAMPLES)[valid].long()

@@ -98,10 +98,7 @@ def footprint_points(
 
 
 def meets_frustum(
-    points: Float[Tensor, "k 3"],
-    radius: Float[Tensor, "k"] | float,
-    camera: Camera,
-    far: float,
+    points: Float[Tensor, "k 3"], radius: Float[Tensor, "k"] | float, camera: Camera, far: float
 ) -> Bool[Tensor, "k"]:
     """Whether balls around points of the camera's frame meet its view frustum up to ``far``."""
     x, y, z = points.unbind(-1)
@@ -145,7 +142,8 @@ class SparseTsdf:
         self.device = torch.device(device)
         self._keys = torch.empty(0, dtype=torch.long, device=self.device)
         self._slots = torch.empty(0, dtype=torch.long, device=self.device)
-        self._coordinates = torch.empty((0, 3), dtype=torch.long, device=self.device)
+        self.coordinates = torch.empty((0, 3), dtype=torch.long, device=self.device)
+        """Block coordinates (k, 3); block (a, b, c) begins at voxel 8 (a, b, c)."""
         shape = (max(expected_blocks, 1), BLOCK**3)
         self._distance = torch.ones(shape, device=self.device)
         self._weight = torch.zeros(shape, device=self.device)
@@ -155,11 +153,6 @@ class SparseTsdf:
     def __len__(self) -> int:
         """Number of blocks."""
         return len(self._keys)
-
-    @property
-    def coordinates(self) -> Int[Tensor, "k 3"]:
-        """Block coordinates; block (a, b, c) begins at voxel 8 (a, b, c)."""
-        return self._coordinates
 
     @property
     def distance(self) -> Float[Tensor, "k 8 8 8"]:
@@ -214,7 +207,8 @@ class SparseTsdf:
         self._allocate(seen[self.owns(seen, layers=1)])
         if not len(self):
             return
-        table, truncation = planes.table(weight), planes.truncation(self.truncation * self.voxel)
+        table = planes.table(weight)
+        truncation = planes.truncation(self.truncation * self.voxel)
         far = torch.where(valid, depth + truncation.view_as(depth), 0.0).amax()
         if self.device.type == "cuda":
             self.update_by_kernel(table, truncation, camera, T_cw, far)
@@ -236,38 +230,32 @@ class SparseTsdf:
         """
         c = camera
         kernels_for(_SOURCE, self.device)["integrate"](
-            len(self), BLOCK**3, self._coordinates, self._distance, self._weight, table,
+            len(self), BLOCK**3, self.coordinates, self._distance, self._weight, table,
             truncation, T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
             self.voxel, *self.contraction.centre, self.contraction.radius,
         )  # fmt: skip
 
     def _allocate(self, blocks: Int[Tensor, "k 3"]) -> None:
-        keys = pack(blocks)
-        if len(self):
-            place = torch.searchsorted(self._keys, keys).clamp(max=len(self) - 1)
-            keys = keys[self._keys[place] != keys]
-        if not len(keys):
+        """Add the blocks that the volume does not have yet."""
+        blocks = blocks[self.slots_of(blocks) < 0]
+        if not len(blocks):
             return
-        old, total = len(self), len(self) + len(keys)
-        self._reserve(total)
-        slots = torch.arange(old, total, device=self.device)
-        self._keys, order = torch.cat([self._keys, keys]).sort()
-        self._slots = torch.cat([self._slots, slots])[order]
-        self._coordinates = torch.cat([self._coordinates, unpack(keys)])
-
-    def _reserve(self, blocks: int) -> None:
+        old = len(self)
+        total = old + len(blocks)
         capacity = len(self._distance)
-        if blocks <= capacity:
-            return
-        extra = (max(blocks, capacity + capacity // 2) - capacity, BLOCK**3)
-        ones, zeros = self._distance.new_ones(extra), self._weight.new_zeros(extra)
-        self._distance = torch.cat([self._distance, ones])
-        self._weight = torch.cat([self._weight, zeros])
+        if total > capacity:
+            extra = (max(total, capacity + capacity // 2) - capacity, BLOCK**3)
+            self._distance = torch.cat([self._distance, self._distance.new_ones(extra)])
+            self._weight = torch.cat([self._weight, self._weight.new_zeros(extra)])
+        slots = torch.arange(old, total, device=self.device)
+        self._keys, order = torch.cat([self._keys, pack(blocks)]).sort()
+        self._slots = torch.cat([self._slots, slots])[order]
+        self.coordinates = torch.cat([self.coordinates, blocks])
 
     def _in_view(self, camera: Camera, T_cw: Tensor, far: float) -> Int[Tensor, "k"]:
         """Slots of the blocks whose bounding sphere meets the view frustum up to ``far``."""
         side = self.voxel * BLOCK
-        middle = (self._coordinates + 0.5).double() * side
+        middle = (self.coordinates + 0.5).double() * side
         centre, radius = self.contraction.balls(middle, side * 0.5 * 3**0.5)
         points = centre @ T_cw[:3, :3].mT + T_cw[:3, 3]
         return meets_frustum(points, radius, camera, far).nonzero()[:, 0]
@@ -281,12 +269,15 @@ class SparseTsdf:
         truncation: Float[Tensor, "p"],
     ) -> None:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
-        from geogs.mesh.volume.tsdf_kernels import average_in
+        from geogs.mesh.volume.volume_kernels import average_in
 
         centre = T_cw.new_tensor(self.contraction.centre)[:, None]
-        projection, corner = camera.matrix() @ T_cw[:3], self._coordinates[slots].double().mT
-        rotation, shift = projection[:, :3], projection[:, 3:] + projection[:, :3] @ centre
-        corner, steps = corner * BLOCK * self.voxel - centre, self._offsets.double().mT * self.voxel
+        projection = camera.matrix() @ T_cw[:3]
+        corner = self.coordinates[slots].double().mT
+        rotation = projection[:, :3]
+        shift = projection[:, 3:] + projection[:, :3] @ centre
+        corner = corner * BLOCK * self.voxel - centre
+        steps = self._offsets.double().mT * self.voxel
         block, local = _rows(rotation @ corner + shift), (rotation @ steps).float().numpy()
         distance, weight = self._distance.numpy(), self._weight.numpy()
         planes, reach, number = table.numpy(), truncation.numpy(), slots.numpy()

@@ -29,7 +29,9 @@ def adam_rows(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _adam(p, grad, first, second, visible, steps, corrections1, corrections2, rate, b1, b2, eps):
-    beta1, beta2, epsilon = numba.float32(b1), numba.float32(b2), numba.float32(eps)
+    beta1 = numba.float32(b1)
+    beta2 = numba.float32(b2)
+    epsilon = numba.float32(eps)
     new1, new2 = numba.float32(1 - b1), numba.float32(1 - b2)
     for i in range(p.shape[0]):
         if not visible[i]:

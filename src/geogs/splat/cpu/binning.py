@@ -7,13 +7,7 @@ import numpy as np
 
 from geogs.kernel_parts import inlined
 from geogs.splat.cpu import layout as at
-from geogs.splat.cpu.layout import (
-    MARGIN,
-    PER_DISK,
-    ROWS_PER_RUN,
-    TILE_HEIGHT,
-    TILE_WIDTH,
-)
+from geogs.splat.cpu.layout import MARGIN, PER_DISK, ROWS_PER_RUN, TILE_HEIGHT, TILE_WIDTH
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
@@ -39,8 +33,10 @@ def sort_by_digit(keys, order, shift, starts, sorted_keys, sorted_order):
 @numba.njit(**inlined(PER_DISK))
 def rows_within(outline, left, right):
     """Lowest and highest y of an outline's part with left <= x <= right."""
-    lowest, highest = np.inf, -np.inf
-    middle_x, half_x = outline[at.MIDDLE_X], outline[at.HALF_X]
+    lowest = np.inf
+    highest = -np.inf
+    middle_x = outline[at.MIDDLE_X]
+    half_x = outline[at.HALF_X]
     low, high = max(left - middle_x, -half_x), min(right - middle_x, half_x)
     if low <= high:
         x = min(max(outline[at.TOP], low), high)
@@ -69,8 +65,10 @@ def cut_disks(boxes, outlines, slots, columns, start, stop, pair_runs, counts):
         if slots[i] == slots[i + 1]:
             continue
         y0, y1 = boxes[i, 2], boxes[i, 3]
-        first_row, last_row = y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1
-        first_column, last_column = boxes[i, 0] // TILE_WIDTH, (boxes[i, 1] - 1) // TILE_WIDTH + 1
+        first_row = y0 // TILE_HEIGHT
+        last_row = (y1 - 1) // TILE_HEIGHT + 1
+        first_column = boxes[i, 0] // TILE_WIDTH
+        last_column = (boxes[i, 1] - 1) // TILE_WIDTH + 1
         for col in range(first_column, last_column):
             left = col * TILE_WIDTH
             lowest, highest = rows_within(outlines[i], left, left + TILE_WIDTH - 1)
@@ -103,7 +101,8 @@ def list_disks(
     for k in range(order.shape[0]):
         i = order[k]
         top, bottom = boxes[i, 2] // TILE_HEIGHT, (boxes[i, 3] - 1) // TILE_HEIGHT + 1
-        first_column, last_column = boxes[i, 0] // TILE_WIDTH, (boxes[i, 1] - 1) // TILE_WIDTH + 1
+        first_column = boxes[i, 0] // TILE_WIDTH
+        last_column = (boxes[i, 1] - 1) // TILE_WIDTH + 1
         for row in range(max(top, first_row), min(bottom, last_row)):
             slot = slots[i] + (row - top) * (last_column - first_column)
             for t in range(row * columns + first_column, row * columns + last_column):

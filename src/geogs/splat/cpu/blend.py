@@ -57,10 +57,19 @@ def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
     loops, because in one the long chain of dependent results of each pixel would stall the
     processor.
     """
-    mx, my, opacity, wc = r[at.MX], r[at.MY], r[at.OPACITY], r[at.WC]
-    ux, uy, vx, vy, wx, wy = r[at.UX], r[at.UY], r[at.VX], r[at.VY], r[at.WX], r[at.WY]
+    mx = r[at.MX]
+    my = r[at.MY]
+    opacity = r[at.OPACITY]
+    wc = r[at.WC]
+    ux = r[at.UX]
+    uy = r[at.UY]
+    vx = r[at.VX]
+    vy = r[at.VY]
+    wx = r[at.WX]
+    wy = r[at.WY]
     nx, ny, nz = r[at.NX], r[at.NY], r[at.NZ]
-    nearest, furthest = r[at.Z_NEAREST], r[at.Z_FURTHEST]
+    nearest = r[at.Z_NEAREST]
+    furthest = r[at.Z_FURTHEST]
     least = wc * MIN_HIT_RATIO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
@@ -74,7 +83,9 @@ def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
         state[_ALPHA + j] = min(opacity * exp_minus(rho3 if on_plane else rho2), MAX_ALPHA)
     shown = ZERO
     for j in range(first * _RUN, last * _RUN):
-        a, z, light = state[_ALPHA + j], state[_DEPTH + j], state[_LIGHT + j]
+        a = state[_ALPHA + j]
+        z = state[_DEPTH + j]
+        light = state[_LIGHT + j]
         weight = light * a
         left = light - weight
         hit = a >= MIN_ALPHA
@@ -98,13 +109,15 @@ def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
 @numba.njit(**_PART)
 def live_runs(state):
     """First and last (exclusive) run in which some pixel still takes light."""
-    first, last = _RUNS, 0
+    first = _RUNS
+    last = 0
     for run in range(_RUNS):
         most = -ONE
         for j in range(np.uint64(run * LANES), np.uint64(run * LANES + LANES)):
             most = max(most, state[_LIGHT + j])
         if most > ZERO:
-            first, last = min(first, run), run + 1
+            first = min(first, run)
+            last = run + 1
     return first, last
 
 
@@ -115,7 +128,8 @@ def clear_state(state, left, top, width, height):
     for row in range(TILE_HEIGHT):
         for col in range(TILE_WIDTH):
             j = np.uint64(row * TILE_WIDTH + col)
-            state[_X + j], state[_Y + j] = left + col, top + row
+            state[_X + j] = left + col
+            state[_Y + j] = top + row
             state[_LIGHT + j] = ONE if (left + col < width) & (top + row < height) else -ONE
 
 
@@ -152,7 +166,8 @@ def blend_tiles(
     for tile in range(first_tile, last_tile):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         clear_state(state, left, top, width, height)
-        first, last = offsets[tile], offsets[tile + 1]
+        first = offsets[tile]
+        last = offsets[tile + 1]
         z_reference = reference_depth(records, lists, first, last) if last > first else ZERO
         first_run, last_run = live_runs(state)
         for k in range(first, last):

@@ -41,9 +41,18 @@ def meet_disk(state, first, last, r, rank, inverse_near):
     plane and else 0; and where the Gaussian is that of the plane, z u in U, z v in V and z rho in
     BEND, else 0, and 1 in BLUR.
     """
-    mx, my, opacity, wc = r[at.MX], r[at.MY], r[at.OPACITY], r[at.WC]
-    ux, uy, vx, vy, wx, wy = r[at.UX], r[at.UY], r[at.VX], r[at.VY], r[at.WX], r[at.WY]
-    nearest, furthest = r[at.Z_NEAREST], r[at.Z_FURTHEST]
+    mx = r[at.MX]
+    my = r[at.MY]
+    opacity = r[at.OPACITY]
+    wc = r[at.WC]
+    ux = r[at.UX]
+    uy = r[at.UY]
+    vx = r[at.VX]
+    vy = r[at.VY]
+    wx = r[at.WX]
+    wy = r[at.WY]
+    nearest = r[at.Z_NEAREST]
+    furthest = r[at.Z_FURTHEST]
     least = wc * MIN_HIT_RATIO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
@@ -81,13 +90,17 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
     stall the processor.
     """
     meet_disk(state, first, last, r, rank, inverse_near)
-    mx, my, opacity = r[at.MX], r[at.MY], r[at.OPACITY]
+    mx = r[at.MX]
+    my = r[at.MY]
+    opacity = r[at.OPACITY]
     nx, ny, nz = r[at.NX], r[at.NY], r[at.NZ]
     s_u = s_ux = s_uy = s_v = s_vx = s_vy = s_w = s_wx = s_wy = ZERO
     s_clamped = s_mx = s_my = s_opacity = s_nx = s_ny = s_nz = ZERO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
-        a, zc, z_free = state[_ALPHA + j], state[_DEPTH + j] - z_reference, state[_FREE_DEPTH + j]
+        a = state[_ALPHA + j]
+        zc = state[_DEPTH + j] - z_reference
+        z_free = state[_FREE_DEPTH + j]
         inverse = ONE / (ONE - a)
         light_behind = state[_LIGHT + j]
         light = light_behind * inverse
@@ -96,9 +109,12 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         covered = ONE - light
         q = zc * covered - moment
         sign = ONE if q > ZERO else -ONE
-        d_z, d_distortion = state[_D_Z + j], state[_D_DISTORTION + j]
+        d_z = state[_D_Z + j]
+        d_distortion = state[_D_DISTORTION + j]
         h_x, h_y, h_z = state[_D_NORMAL_X + j], state[_D_NORMAL_Y + j], state[_D_NORMAL_Z + j]
-        signs, signed_z, behind = state[_SIGNS + j], state[_SIGNED_Z + j], state[_BEHIND + j]
+        signs = state[_SIGNS + j]
+        signed_z = state[_SIGNED_Z + j]
+        behind = state[_BEHIND + j]
         g_weight = state[_D_CONSTANT + j] + d_z * zc + h_x * nx + h_y * ny + h_z * nz
         g_weight += d_distortion * (abs(q) + signed_z - zc * signs)
         g_z = weight * (d_z + d_distortion * (sign * covered - signs))
@@ -111,7 +127,9 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         state[_SIGNED_Z + j] = signed_z + weight * sign * zc
 
         g_rho = -TWO * g_alpha
-        g_u, g_v, g_rho2 = g_rho * state[_U + j], g_rho * state[_V + j], g_rho * state[_BLUR + j]
+        g_u = g_rho * state[_U + j]
+        g_v = g_rho * state[_V + j]
+        g_rho2 = g_rho * state[_BLUR + j]
         g_w = -z_free * z_free * g_z - g_rho * state[_BEND + j]
         s_u += g_u
         s_ux += g_u * dx
@@ -129,11 +147,22 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         s_nx += weight * h_x
         s_ny += weight * h_y
         s_nz += weight * h_z
-    g[at.G_U], g[at.G_UX], g[at.G_UY] = s_u, s_ux, s_uy
-    g[at.G_V], g[at.G_VX], g[at.G_VY] = s_v, s_vx, s_vy
-    g[at.G_W], g[at.G_WX], g[at.G_WY], g[at.G_CLAMPED] = s_w, s_wx, s_wy, s_clamped
-    g[at.G_MX], g[at.G_MY], g[at.G_OPACITY] = s_mx, s_my, s_opacity / opacity
-    g[at.G_NX], g[at.G_NY], g[at.G_NZ] = s_nx, s_ny, s_nz
+    g[at.G_U] = s_u
+    g[at.G_UX] = s_ux
+    g[at.G_UY] = s_uy
+    g[at.G_V] = s_v
+    g[at.G_VX] = s_vx
+    g[at.G_VY] = s_vy
+    g[at.G_W] = s_w
+    g[at.G_WX] = s_wx
+    g[at.G_WY] = s_wy
+    g[at.G_CLAMPED] = s_clamped
+    g[at.G_MX] = s_mx
+    g[at.G_MY] = s_my
+    g[at.G_OPACITY] = s_opacity / opacity
+    g[at.G_NX] = s_nx
+    g[at.G_NY] = s_ny
+    g[at.G_NZ] = s_nz
 
 
 @numba.njit(**_PART)
@@ -149,7 +178,8 @@ def load_state(state, saved, left, top, d_depth, d_normal, d_alpha, d_distortion
         for col in range(TILE_WIDTH):
             j = np.uint64(row * TILE_WIDTH + col)
             x, y = left + col, top + row
-            state[_X + j], state[_Y + j] = x, y
+            state[_X + j] = x
+            state[_Y + j] = y
             state[_LIGHT + j] = saved[at.SAVED_LIGHT, row * TILE_WIDTH + col]
             state[_MOMENT + j] = saved[at.SAVED_MOMENT, row * TILE_WIDTH + col]
             state[_LAST + j] = saved[at.SAVED_LAST, row * TILE_WIDTH + col]
@@ -180,10 +210,12 @@ def last_of_runs(state, last_of):
 @numba.njit(**_PART)
 def blended_runs(last_of, rank):
     """First and last (exclusive) run that blends some disk of at least this rank."""
-    first, last = _RUNS, 0
+    first = _RUNS
+    last = 0
     for run in range(_RUNS):
         if last_of[run] >= rank:
-            first, last = min(first, run), run + 1
+            first = min(first, run)
+            last = run + 1
     return first, last
 
 
@@ -201,7 +233,8 @@ def unblend_tiles(
     last_of = np.empty(_RUNS, np.float32)
     for tile in range(first_tile, last_tile):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
-        first, last = offsets[tile], offsets[tile + 1]
+        first = offsets[tile]
+        last = offsets[tile + 1]
         if first == last:
             continue
         z_reference = reference_depth(records, lists, first, last)
@@ -209,7 +242,8 @@ def unblend_tiles(
         used = last_of_runs(state, last_of)
         for k in range(first + used, last):
             gradients[k, :] = ZERO
-        first_run, last_run = 0, _RUNS
+        first_run = 0
+        last_run = _RUNS
         for k in range(first + used - 1, first - 1, -1):
             rank = np.float32(k - first + 1)
             if (k - first) % CHECK_EVERY == CHECK_EVERY - 1:

@@ -38,7 +38,10 @@ def _in_view(centres, radii, poses, slopes):
     seen = np.zeros(len(centres), np.bool_)
     lengths = np.sqrt(1 + slopes * slopes)
     for i in range(len(centres)):
-        x, y, z, r = centres[i, 0], centres[i, 1], centres[i, 2], radii[i]
+        x = centres[i, 0]
+        y = centres[i, 1]
+        z = centres[i, 2]
+        r = radii[i]
         for k in range(len(poses)):
             T = poses[k]
             c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]

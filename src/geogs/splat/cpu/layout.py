@@ -30,18 +30,14 @@ OUTLINE = 10
 """Numbers (float64) that bound the pixels of a disk: an ellipse about MIDDLE and a circle of radius
 BLUR about the projected CENTER. At x from MIDDLE the ellipse spans
 SLOPE x +- SIDE sqrt(1 - (x / HALF_X)^2); its highest point, y = HALF_Y, is at x = TOP."""
-(
-    CENTER_X, CENTER_Y, BLUR, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y, SLOPE, SIDE, TOP,
-) = range(10)  # fmt: skip
+(CENTER_X, CENTER_Y, BLUR, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y, SLOPE, SIDE, TOP) = range(10)
 
 MARGIN = 0.01
 """Pixels by which outlines are widened against rounding."""
 
 RECORD = 16
 """Floats per record: one cache line."""
-(
-    MX, MY, UX, UY, VX, VY, WX, WY, WC, OPACITY, NX, NY, NZ, Z_NEAREST, Z_FURTHEST,
-) = range(15)  # fmt: skip
+(MX, MY, UX, UY, VX, VY, WX, WY, WC, OPACITY, NX, NY, NZ, Z_NEAREST, Z_FURTHEST) = range(15)
 
 GRADIENT = 16
 """Floats per list entry that the backward pass sums over pixels, in the order below."""
@@ -57,10 +53,7 @@ SAVED_LIGHT, SAVED_MOMENT, SAVED_LAST = range(3)
 MIN_ALPHA = np.float32(1 / 255)
 MAX_ALPHA = np.float32(0.99)
 MIN_TRANSMITTANCE = np.float32(1e-4)
-MIN_FACING = 1e-4
 MIN_HIT_RATIO = np.float32(1e-4)
-MAX_REACH_RATIO = 1e3
-MAX_LOG_SCALE = 40.0
 
 ZERO = np.float32(0)
 HALF = np.float32(0.5)

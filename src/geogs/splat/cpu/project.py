@@ -11,16 +11,8 @@ import numpy as np
 
 from geogs.kernel_parts import inlined
 from geogs.splat.cpu import layout as at
-from geogs.splat.cpu.layout import (
-    MARGIN,
-    MAX_LOG_SCALE,
-    MAX_REACH_RATIO,
-    MIN_ALPHA,
-    MIN_FACING,
-    PER_DISK,
-    TILE_HEIGHT,
-    TILE_WIDTH,
-)
+from geogs.splat.cpu.layout import MARGIN, MIN_ALPHA, PER_DISK, TILE_HEIGHT, TILE_WIDTH
+from geogs.splat.reference import MAX_LOG_SCALE, MAX_REACH_RATIO, MIN_FACING
 
 _PART = inlined(PER_DISK)
 _SQRT_HALF = math.sqrt(0.5)
@@ -55,12 +47,10 @@ def axes_of(w, x, y, z):
 @numba.njit(**_PART)
 def unit_quaternion(quaternion, i):
     """The normalised quaternion of disk i, and 1 / norm."""
-    w, x, y, z = (
-        np.float64(quaternion[i, 0]),
-        np.float64(quaternion[i, 1]),
-        np.float64(quaternion[i, 2]),
-        np.float64(quaternion[i, 3]),
-    )
+    w = np.float64(quaternion[i, 0])
+    x = np.float64(quaternion[i, 1])
+    y = np.float64(quaternion[i, 2])
+    z = np.float64(quaternion[i, 3])
     inverse_norm = 1 / math.sqrt(w * w + x * x + y * y + z * z)
     return (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm), inverse_norm
 
@@ -103,10 +93,14 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     """
     fx, fy = intrinsics[0], intrinsics[1]
     radius2 = 2 * math.log(opacity / MIN_ALPHA)
-    outline[at.CENTER_X], outline[at.CENTER_Y], outline[at.BLUR] = mx, my, math.sqrt(radius2 / 2)
+    outline[at.CENTER_X] = mx
+    outline[at.CENTER_Y] = my
+    outline[at.BLUR] = math.sqrt(radius2 / 2)
     d = radius2 * (u[2] * u[2] + v[2] * v[2]) - c[2] * c[2]
     if d > -1e-6 * c[2] * c[2]:
-        outline[at.BLUR], outline[at.MIDDLE_X], outline[at.HALF_X] = np.inf, mx, -1
+        outline[at.BLUR] = np.inf
+        outline[at.MIDDLE_X] = mx
+        outline[at.HALF_X] = -1
         return False
     x, y = c[0] / c[2], c[1] / c[2]
     ux, vx = fx * (u[0] - x * u[2]), fx * (v[0] - x * v[2])
@@ -116,9 +110,12 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     xx = max(ox * ox - k * (ux * ux + vx * vx), 1e-6)
     yy = max(oy * oy - k * (uy * uy + vy * vy), 1e-6)
     xy = ox * oy - k * (ux * uy + vx * vy)
-    outline[at.MIDDLE_X], outline[at.MIDDLE_Y] = mx + ox, my + oy
-    outline[at.HALF_X], outline[at.HALF_Y] = math.sqrt(xx), math.sqrt(yy)
-    outline[at.SLOPE], outline[at.SIDE] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
+    outline[at.MIDDLE_X] = mx + ox
+    outline[at.MIDDLE_Y] = my + oy
+    outline[at.HALF_X] = math.sqrt(xx)
+    outline[at.HALF_Y] = math.sqrt(yy)
+    outline[at.SLOPE] = xy / xx
+    outline[at.SIDE] = math.sqrt(max(yy - xy * xy / xx, 0.0))
     outline[at.TOP] = xy / outline[at.HALF_Y]
     return True
 
@@ -126,10 +123,14 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
 @numba.njit(**_PART)
 def box_of(outline, width, height):
     """Pixels (x0, x1, y0, y1) within an outline."""
-    x, y, blur = outline[at.CENTER_X], outline[at.CENTER_Y], outline[at.BLUR]
-    middle, half = outline[at.MIDDLE_X], outline[at.HALF_X]
+    x = outline[at.CENTER_X]
+    y = outline[at.CENTER_Y]
+    blur = outline[at.BLUR]
+    middle = outline[at.MIDDLE_X]
+    half = outline[at.HALF_X]
     x0, x1 = pixel_range(min(middle - half, x - blur), max(middle + half, x + blur), width)
-    middle, half = outline[at.MIDDLE_Y], outline[at.HALF_Y]
+    middle = outline[at.MIDDLE_Y]
+    half = outline[at.HALF_Y]
     y0, y1 = pixel_range(min(middle - half, y - blur), max(middle + half, y + blur), height)
     return x0, x1, y0, y1
 
@@ -169,7 +170,9 @@ def project_disks(
         if opacity < MIN_ALPHA:
             continue
         tu, tv, n = axes_of(*unit_quaternion(quaternion, i)[0])
-        a, b, n = rotate(T, tu), rotate(T, tv), rotate(T, n)
+        a = rotate(T, tu)
+        b = rotate(T, tv)
+        n = rotate(T, n)
         su, sv = math.exp(np.float64(log_scale[i, 0])), math.exp(np.float64(log_scale[i, 1]))
         u, v = (su * a[0], su * a[1], su * a[2]), (sv * b[0], sv * b[1], sv * b[2])
         mx, my = fx * c[0] / c[2] + cx, fy * c[1] / c[2] + cy
@@ -178,20 +181,32 @@ def project_disks(
             x0, x1, y0, y1 = box_of(outlines[i], width, height)
         if x0 >= x1 or y0 >= y1:
             continue
-        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1
+        boxes[i, 0] = x0
+        boxes[i, 1] = x1
+        boxes[i, 2] = y0
+        boxes[i, 3] = y1
         columns = (x1 - 1) // TILE_WIDTH - x0 // TILE_WIDTH + 1
         pairs[i] = columns * ((y1 - 1) // TILE_HEIGHT - y0 // TILE_HEIGHT + 1)
         facing, _ = bounded_facing(n, c)
         ex, ey = n[0] / facing, n[1] / facing
-        ac, bc = dot(a, c), dot(b, c)
+        ac = dot(a, c)
+        bc = dot(b, c)
         ku, kv = _SQRT_HALF / su, _SQRT_HALF / sv
         reach = 3 * math.sqrt(u[2] * u[2] + v[2] * v[2])
         away = -1.0 if facing > 0 else 1.0
         r = records[i]
-        r[at.MX], r[at.MY], r[at.OPACITY] = mx, my, opacity
-        r[at.UX], r[at.UY] = ku * (a[0] - ac * ex) / fx, ku * (a[1] - ac * ey) / fy
-        r[at.VX], r[at.VY] = kv * (b[0] - bc * ex) / fx, kv * (b[1] - bc * ey) / fy
-        r[at.WX], r[at.WY], r[at.WC] = ex / fx, ey / fy, 1 / c[2]
-        r[at.NX], r[at.NY], r[at.NZ] = away * n[0], away * n[1], away * n[2]
+        r[at.MX] = mx
+        r[at.MY] = my
+        r[at.OPACITY] = opacity
+        r[at.UX] = ku * (a[0] - ac * ex) / fx
+        r[at.UY] = ku * (a[1] - ac * ey) / fy
+        r[at.VX] = kv * (b[0] - bc * ex) / fx
+        r[at.VY] = kv * (b[1] - bc * ey) / fy
+        r[at.WX] = ex / fx
+        r[at.WY] = ey / fy
+        r[at.WC] = 1 / c[2]
+        r[at.NX] = away * n[0]
+        r[at.NY] = away * n[1]
+        r[at.NZ] = away * n[2]
         r[at.Z_NEAREST] = c[2] - min(reach, c[2] - near)
         r[at.Z_FURTHEST] = c[2] + min(reach, MAX_REACH_RATIO * c[2])

@@ -7,9 +7,7 @@ import numpy as np
 
 from geogs.kernel_parts import inlined
 from geogs.splat.cpu import layout as at
-from geogs.splat.cpu.layout import (
-    PER_DISK,
-)
+from geogs.splat.cpu.layout import PER_DISK
 from geogs.splat.cpu.project import axes_of, bounded_facing, dot, place, rotate, unit_quaternion
 
 _PART = inlined(PER_DISK)
@@ -62,7 +60,8 @@ def record_backward(record, g, axes, c, ku, kv, intrinsics):
     a, b, n = axes
     facing, is_bounded = bounded_facing(n, c)
     h = 1 / facing
-    ac, bc = dot(a, c), dot(b, c)
+    ac = dot(a, c)
+    bc = dot(b, c)
     # With e = n / (n . c): u = ku (a - (a . c) e) / f, v = kv (b - (b . c) e) / f, w = e / f.
     pu = ku * g[at.G_UX] / fx, ku * g[at.G_UY] / fy
     pv = kv * g[at.G_VX] / fx, kv * g[at.G_VY] / fy
@@ -85,13 +84,18 @@ def record_backward(record, g, axes, c, ku, kv, intrinsics):
     g_my = fy * (g[at.G_MY] - g_u * record[at.UY] - g_v * record[at.VY] - g_w * record[at.WY])
     # g_w is the sum for w where the plane gave the depth; where the depth was clamped to a constant
     # distance from the centre, G_CLAMPED goes to c_z directly.
-    x, y, inverse_z = c[0] / c[2], c[1] / c[2], 1 / c[2]
+    x = c[0] / c[2]
+    y = c[1] / c[2]
+    inverse_z = 1 / c[2]
     g_c = (
         g_ac * a[0] + g_bc * b[0] + g_facing * n[0] + g_mx * inverse_z,
         g_ac * a[1] + g_bc * b[1] + g_facing * n[1] + g_my * inverse_z,
-        g_ac * a[2] + g_bc * b[2] + g_facing * n[2] + g[at.G_CLAMPED]
+        g_ac * a[2]
+        + g_bc * b[2]
+        + g_facing * n[2]
+        + g[at.G_CLAMPED]
         - (g_mx * x + g_my * y + g_w * inverse_z) * inverse_z,
-    )  # fmt: skip
+    )
     return g_a, g_b, g_n, g_c
 
 
@@ -122,7 +126,8 @@ def project_disks_backward(
             d_log_scale[i, :] = 0
             d_opacity_logit[i] = 0
             continue
-        r, g = records[i], sums[i]
+        r = records[i]
+        g = sums[i]
         p, c = place(position, i, T)
         q, inverse_norm = unit_quaternion(quaternion, i)
         tu, tv, tn = axes_of(*q)

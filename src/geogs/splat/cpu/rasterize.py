@@ -1,8 +1,12 @@
 """The renderer's two passes on plain arrays."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.splat.cpu.binning import DIGIT_BITS, DIGITS, cut_disks, list_disks, sort_by_digit
@@ -21,7 +25,9 @@ from geogs.splat.cpu.layout import (
 )
 from geogs.splat.cpu.project import project_disks
 from geogs.splat.cpu.project_backward import project_disks_backward, sum_pairs
-from geogs.threads import run_chunks
+from geogs.splat.protocols import Backward
+from geogs.threads import run_chunks, worker_count
+from geogs.world.disks import DiskParameters
 
 # More chunks than threads, so that threads finish together; neighbouring tiles share a chunk, and
 # with it the disks in the cache. One thread waits for no other.
@@ -77,7 +83,9 @@ def rasterize_forward(
     The result is the same, bit by bit, for any number of threads. Without trace a backward pass is
     not possible.
     """
-    n, width, height = len(parameters[0]), camera.width, camera.height
+    n = len(parameters[0])
+    width = camera.width
+    height = camera.height
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
     records, outlines = np.empty((n, RECORD), np.float32), np.empty((n, OUTLINE))
     boxes, pairs = np.empty((n, 4), np.int32), np.empty(n, np.int32)
@@ -89,7 +97,8 @@ def rasterize_forward(
         _DISK_CHUNKS, threads,
     )  # fmt: skip
     lists = list_tiles(records, outlines, boxes, pairs, width, height, threads)
-    shape, tiles = (height, width), len(lists.offsets) - 1
+    shape = (height, width)
+    tiles = len(lists.offsets) - 1
     planes = shape, (*shape, 3), shape, shape, shape
     maps = (*(np.empty(plane, np.float32) for plane in planes), np.zeros(n, np.bool_))
     saved = np.empty((tiles if with_trace else 0, SAVED, TILE_PIXELS), np.float32)
@@ -153,7 +162,9 @@ def list_tiles(
     threads: int,
 ) -> TileLists:
     """Sort the projected disks by depth and assign them to tiles."""
-    n, columns, rows = len(pairs), -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
+    n = len(pairs)
+    columns = -(-width // TILE_WIDTH)
+    rows = -(-height // TILE_HEIGHT)
     slots = np.zeros(n + 1, np.int64)
     np.cumsum(pairs, out=slots[1:])
     counts = np.zeros((_DISK_CHUNKS, columns * rows), np.int64)
@@ -162,8 +173,9 @@ def list_tiles(
         lambda c: cut_disks(
             boxes, outlines, slots, columns, *_span(n, c, _DISK_CHUNKS), pair_runs, counts[c]
         ),
-        _DISK_CHUNKS, threads,
-    )  # fmt: skip
+        _DISK_CHUNKS,
+        threads,
+    )
     offsets = np.zeros(columns * rows + 1, np.int64)
     np.cumsum(counts.sum(0), out=offsets[1:])
     order, cursor = sort_by_depth(records, pairs), offsets[:-1].copy()
@@ -186,7 +198,8 @@ def sort_by_depth(records: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """
     order = np.flatnonzero(pairs).astype(np.int32)
     keys = (1 / records[order, WC]).view(np.uint32)
-    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
+    other_keys = np.empty_like(keys)
+    other_order = np.empty_like(order)
     starts = np.empty(DIGITS + 1, np.int64)
     for shift in range(0, 32, DIGIT_BITS):
         sort_by_digit(keys, order, np.uint32(shift), starts, other_keys, other_order)
@@ -207,3 +220,33 @@ def _cache_aligned(count: int) -> np.ndarray:
     raw = np.empty(4 * count + 64, np.uint8)
     start = -raw.ctypes.data % 64
     return raw[start : start + 4 * count].view(np.float32)
+
+
+def rendered(
+    disks: DiskParameters, camera: Camera, T_cw: Float[Tensor, "4 4"], near: float, with_trace: bool
+) -> tuple[tuple[Tensor, ...], Backward]:
+    """Maps of one pose, as in ``RenderOutput``, and their backward pass.
+
+    The backward pass takes the gradients of depth, normal, alpha and distortion, None for zero, and
+    returns those of the disks and, float64, of the pose. It may be called again, not without trace.
+    """
+    x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
+    pose = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy()
+    threads = worker_count()
+    maps, trace = rasterize_forward((x, q, scale, logit), camera, pose, near, threads, with_trace)
+    shown = tuple(map(torch.from_numpy, maps))
+    shapes = [m.shape for m in shown[:4]]  # not the maps, which belong to the graph
+
+    def back(
+        gradients: Sequence[Tensor | None], with_pose: bool
+    ) -> tuple[DiskParameters, Float[Tensor, "4 4"]]:
+        depth, normal, alpha, distortion = (
+            (torch.zeros(shape) if g is None else g).to(torch.float32).contiguous().numpy()
+            for g, shape in zip(gradients, shapes, strict=True)
+        )
+        d_disks, rows = rasterize_backward(trace, depth, normal, alpha, distortion, threads)
+        d_T = torch.zeros(4, 4, dtype=torch.float64)
+        d_T[:3] = torch.from_numpy(rows)
+        return DiskParameters(*map(torch.from_numpy, d_disks)), d_T
+
+    return shown, back

@@ -1,5 +1,9 @@
 """The passes of the renderer on a GPU."""
 
+import contextlib
+import functools
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +13,8 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import to_device
+from geogs.splat.protocols import Backward
 from geogs.world.disks import DiskParameters
 
 SOURCE = Path(__file__).with_name("renderer.cu")
@@ -32,11 +38,6 @@ class Views:
     count: Int[Tensor, "1"] | None = None
     """Number of disks, int32 on the device; by default all that the parameters have room for."""
 
-    @property
-    def pose_size(self) -> int:
-        """Count of numbers from one pose to the next."""
-        return self.poses.stride(0)
-
 
 @dataclass(slots=True)
 class Maps:
@@ -53,15 +54,11 @@ class Maps:
     @staticmethod
     def empty(camera: Camera, views: tuple[int, ...], disks: int, device: torch.device) -> "Maps":
         """Uninitialised maps."""
-        shape = (*views, camera.height, camera.width)
-        return Maps(
-            depth=torch.empty(shape, device=device),
-            normal=torch.empty((*views, 3, camera.height, camera.width), device=device),
-            alpha=torch.empty(shape, device=device),
-            distortion=torch.empty(shape, device=device),
-            median_depth=torch.empty(shape, device=device),
-            visible=torch.empty(disks, dtype=torch.bool, device=device),
-        )
+        size = (camera.height, camera.width)
+        depth, alpha, spread, median = (torch.empty(*views, *size, device=device) for _ in range(4))
+        normal = torch.empty(*views, 3, *size, device=device)
+        visible = torch.empty(disks, dtype=torch.bool, device=device)
+        return Maps(depth, normal, alpha, spread, median, visible)
 
 
 @dataclass(slots=True)
@@ -87,17 +84,23 @@ class Rasterizer:
     def __init__(
         self, capacity: int, views: int, camera: Camera, near: float, device: torch.device
     ) -> None:
-        self.capacity, self.views, self.camera, self.near = capacity, views, camera, near
+        self.capacity = capacity
+        self.views = views
+        self.camera = camera
+        self.near = near
         self.device = device
         self._kernels = kernels_for(SOURCE, device)
         self._tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
         self._blocks = -(-capacity // THREADS)
-        tiles, pixels = views * self._tiles, views * camera.height * camera.width
+        tiles = views * self._tiles
+        pixels = views * camera.height * camera.width
         counts = torch.zeros(2 + tiles, dtype=torch.int32, device=device)
-        self.status, self._counts = counts[:2], counts[2:]
+        self.status = counts[:2]
+        self._counts = counts[2:]
         """Status: most entries of any pass so far; 1 once there was no room for all of them."""
         places = torch.empty(2 * tiles + 1, dtype=torch.int32, device=device)
-        self._offsets, self._cursor = places[: tiles + 1], places[tiles + 1 :]
+        self._offsets = places[: tiles + 1]
+        self._cursor = places[tiles + 1 :]
         self._records = torch.empty(views, capacity, RECORD, device=device)
         self._outlines = torch.empty(views, capacity, OUTLINE, device=device)
         self._saved = torch.empty(views, 2, camera.height, camera.width, device=device)
@@ -129,13 +132,11 @@ class Rasterizer:
         c = self.camera
         self._kernels["project_disks"](
             (self._blocks, self.views), THREADS, self.capacity, views.count, *disks, views.poses,
-            views.pose_size, views.batch, c.fx, c.fy, c.cx, c.cy, self.near, c.width, c.height,
-            self._records, self._outlines, self._counts, maps.visible,
+            views.poses.stride(0), views.batch, c.fx, c.fy, c.cx, c.cy, self.near,
+            c.width, c.height, self._records, self._outlines, self._counts, maps.visible,
         )  # fmt: skip
-        self._kernels["scan_tiles"](
-            1, 1024, self.views * self._tiles, self.room, self._counts, self._offsets,
-            self._cursor, self.status, self._entries,
-        )  # fmt: skip
+        lists = (self._counts, self._offsets, self._cursor, self.status, self._entries)
+        self._kernels["scan_tiles"](1, 1024, self.views * self._tiles, self.room, *lists)
 
     def note_projection(self) -> None:
         """Let :meth:`has_room` wait only for the work launched so far."""
@@ -186,8 +187,108 @@ class Rasterizer:
         )  # fmt: skip
         self._kernels["project_backward"](
             self._blocks, THREADS, self.capacity, views.count, self.views, *disks, views.poses,
-            views.pose_size, views.batch, c.fx, c.fy, self._outlines, self._sums,
+            views.poses.stride(0), views.batch, c.fx, c.fy, self._outlines, self._sums,
             *(d_disks or (None,) * 4), None if d_poses is None else self._pose_copies,
         )  # fmt: skip
         if d_poses is not None:
             self._kernels["sum_poses"](self.views, 32, self.views, self._pose_copies, d_poses)
+
+
+_Key = tuple[int, int, Camera, float, torch.device, int]
+"""Numbers of disks and views, camera, least depth, device and stream: a rasterizer can be used
+again where all are the same."""
+
+
+@functools.cache
+def _resting() -> deque[tuple[_Key, Rasterizer]]:
+    """The idle rasterizers of the process, the last four used."""
+    return deque(maxlen=4)
+
+
+class Loan:
+    """Holds a rasterizer as long as its rendering may still be differentiated."""
+
+    def __init__(self, key: _Key, rasterizer: Rasterizer) -> None:
+        self.rasterizer = rasterizer
+        self._key = key
+        self._resting = _resting()
+
+    def __del__(self) -> None:
+        self._resting.append((self._key, self.rasterizer))
+
+
+def lend(disks: int, views: int, camera: Camera, near: float, device: torch.device) -> Loan:
+    """A rasterizer for the current stream, whose order keeps its uses apart."""
+    stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+    key = (disks, views, camera, near, device, stream)
+    for entry in list(_resting()):
+        if entry[0] == key:
+            with contextlib.suppress(ValueError):  # another thread was faster
+                _resting().remove(entry)
+                return Loan(*entry)
+    return Loan(key, Rasterizer(disks, views, camera, near, device))
+
+
+def rendered(
+    disks: DiskParameters,
+    camera: Camera,
+    T_cw: Float[Tensor, "*b 4 4"],
+    near: float,
+    with_trace: bool,
+) -> tuple[tuple[Tensor, ...], Backward]:
+    """Maps of one pose or of several, as in ``RenderOutput``, on the GPU that holds the disks, and
+    their backward pass.
+
+    The backward pass takes the gradients of depth, normal (components last), alpha and distortion,
+    None for zero, but not all None. It returns those of the disks and, float64 on their device, of
+    the poses. It may be called again, not without trace; it keeps its rasterizer while it exists.
+
+    The compositing is launched before it is known whether the list entries fit, and once more if
+    they do not: that is known as soon as the projection is done, while the GPU continues.
+    """
+    device = disks.position.device
+    n = len(disks.position)
+    disks = DiskParameters(*(p.detach().contiguous() for p in disks))
+    poses = to_device(T_cw.detach(), device, torch.float64).contiguous().view(-1, 4, 4)
+    views = Views(poses)
+    loan = lend(n, len(poses), camera, near, device)
+    rasterizer = loan.rasterizer
+    maps = Maps.empty(camera, T_cw.shape[:-2], n, device)
+    rasterizer.project(disks, views, maps)
+    rasterizer.note_projection()
+    rasterizer.blend(views, maps, with_trace)
+    if not rasterizer.has_room():
+        rasterizer.project(disks, views, maps)
+        rasterizer.blend(views, maps, with_trace)
+    shape = (*T_cw.shape[:-2], camera.height, camera.width)
+
+    def back(
+        gradients: Sequence[Tensor | None], with_pose: bool
+    ) -> tuple[DiskParameters, Float[Tensor, "b 4 4"] | None]:
+        d_disks = DiskParameters(*(torch.empty_like(p) for p in disks))
+        d_poses = torch.empty_like(views.poses) if with_pose else None
+        given = _map_gradients(gradients, shape)
+        loan.rasterizer.backward(disks, views, given, d_disks, d_poses)
+        return d_disks, d_poses
+
+    normal = maps.normal.movedim(-3, -1)
+    shown = maps.depth, normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible
+    return shown, back
+
+
+def _map_gradients(gradients: Sequence[Tensor | None], shape: tuple[int, ...]) -> MapGradients:
+    """Contiguous float32 gradients; zeros for those that are missing."""
+    known = next(g for g in gradients if g is not None)
+    depth, normal, alpha, distortion = gradients
+    if normal is None:
+        normal = known.new_zeros((3, *shape), dtype=torch.float32)
+        planar = True
+    else:
+        normal = normal.to(torch.float32)
+        planar = normal.movedim(-1, -3).is_contiguous()
+        normal = normal.movedim(-1, -3) if planar else normal.contiguous()
+    d_depth, d_alpha, d_distortion = (
+        (known.new_zeros(shape) if g is None else g).to(torch.float32).contiguous()
+        for g in (depth, alpha, distortion)
+    )
+    return MapGradients(d_depth, normal, d_alpha, d_distortion, planar)

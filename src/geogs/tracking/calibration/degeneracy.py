@@ -26,8 +26,6 @@ MAX_RESIDUAL = 1.0
 mean fails (docs/notebook/calibration.md)."""
 PLANAR_FRACTION = 0.9
 """Fraction of the matches, in all views, explained by a homography, above which a plane is seen."""
-_TOLERANCE = 1 / 1000
-"""Largest deviation from a homography, as a fraction of the long edge."""
 _FIELDS_OF_VIEW = 25.0, 130.0
 """Search range of the field of view of a rotating camera, degrees along the longer side."""
 
@@ -66,20 +64,21 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
     if min(fit.explained for fit in fits) <= PLANAR_FRACTION:
         return None
 
-    def left(angle: float) -> float:
+    def residual(angle: float) -> float:
         """Return the largest residual of a rotation over the views, in pixels."""
         K = camera.with_field_of_view(angle).matrix().numpy()
         return max(_unexplained(K, fit) for fit in fits)
 
-    if left(_FIELDS_OF_VIEW[0]) < min_parallax:
+    if residual(_FIELDS_OF_VIEW[0]) < min_parallax:
         return Degeneracy.TURNING
-    least = minimize_scalar(left, bounds=_FIELDS_OF_VIEW, method="bounded").fun
+    least = minimize_scalar(residual, bounds=_FIELDS_OF_VIEW, method="bounded").fun
     return None if least < min_parallax else Degeneracy.PLANAR
 
 
 def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:
     """Fit the homography of one view (MAGSAC); None where it has too few matches."""
-    match, tolerance = match.on_cpu(), camera.long_edge * _TOLERANCE
+    match = match.on_cpu()
+    tolerance = 1 / 1000 * camera.long_edge  # pixels of deviation from a homography
     used = match.sure()[0].numpy()
     if used.sum() < 50:
         return None

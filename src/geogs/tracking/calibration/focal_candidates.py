@@ -27,8 +27,6 @@ from geogs.world.grid import SampleGrid
 
 FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
 """Candidate fields of view besides the guess, degrees along the longer side."""
-BARREL, OF_BARREL = (-0.2, 0.03), 70.0
-"""k1 and k2 of a typical wide-angle lens, and its field of view."""
 BEND_COST = 0.002
 """Penalty of a distortion of one prior deviation. Errors of matches are correlated, so costs that
 differ by a few per cent mean little: above half of this the wrong minimum of a rotation loses."""
@@ -62,8 +60,11 @@ def candidates(camera: Camera, unknowns: Unknowns) -> list[Camera]:
         return [camera]
     guess = camera.with_focal(camera.fx)
     pinholes = [guess, *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
-    wide = [guess, camera.with_field_of_view(OF_BARREL)] if unknowns.radial else []
-    return [*pinholes, *(c.moved(0.0, *BARREL) for c in wide)]
+    if not unknowns.radial:
+        return pinholes
+    # A typical wide-angle lens sees 70 degrees, with these k1 and k2.
+    wide = [guess, camera.with_field_of_view(70.0)]
+    return [*pinholes, *(c.moved(0.0, -0.2, 0.03) for c in wide)]
 
 
 def try_candidate(
@@ -71,27 +72,34 @@ def try_candidate(
 ) -> Start | None:
     """Locate the keyframes with the pinhole of a lens and adjust them, at last with k1 and k2 if
     these are unknown; None if there is no parallax."""
-    camera, flows = lens.pinhole, [f.on_cpu() for f in flows]
+    camera = lens.pinhole
+    flows = [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view(camera, flows[1::2], min_parallax)
     if found is None:
         return None
-    best, view = 1 + 2 * found[0], found[1]
+    best = 1 + 2 * found[0]
+    view = found[1]
     flows = [without(f, view.apart) for f in flows]
     depth = grid_fields(grid).fill(view.inverse_depth, view.good.float())
     poses = [torch.eye(4, dtype=torch.float64)]
     for n, match in enumerate(flows):
-        T = view.T_ji if n == best else pnp(
-            grid, depth, match.pixels[0], view.good & match.sure()[0]
-        )  # fmt: skip
+        T: Tensor | None = view.T_ji
+        if n != best:
+            T = pnp(grid, depth, match.pixels[0], view.good & match.sure()[0])
         poses.append(poses[-1] if T is None else T)
     n = len(flows) + 1
     rows = torch.cat([depth[None], torch.ones(n - 1, grid.size)])
     problem = BundleProblem(
-        torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
-        torch.arange(n) > 0, torch.ones(n, dtype=torch.bool),
-        pixels=torch.cat([f.pixels for f in flows]), weight=torch.cat([f.weight for f in flows]),
-    )  # fmt: skip
+        torch.stack(poses),
+        rows,
+        torch.zeros(n - 1, dtype=torch.long),
+        torch.arange(1, n),
+        torch.arange(n) > 0,
+        torch.ones(n, dtype=torch.bool),
+        pixels=torch.cat([f.pixels for f in flows]),
+        weight=torch.cat([f.weight for f in flows]),
+    )
     result = _adjusted(problem, LensBlock(lens, grid.pixels, unknowns.focal), unknowns.radial)
     if result is None:
         return None

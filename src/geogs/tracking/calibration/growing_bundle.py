@@ -57,7 +57,9 @@ class GrowingBundle:
         for a rolling shutter."""
         self.grid = grid
         """Grid of the guess; of its camera only the size is used."""
-        self._operator, self._unknowns, self._rows = operator, unknowns, rows
+        self._operator = operator
+        self._unknowns = unknowns
+        self._rows = rows
         self.lens = start.lens
         self.readout = unknowns.readout or 0.0
         """Present readout, seconds."""
@@ -84,17 +86,17 @@ class GrowingBundle:
     def place(self, view: View) -> bool:
         """Append the next view by PnP on the last one's depth; False if that fails."""
         assert view.step is not None
-        grid, step = self._pinhole, view.step.there.on_cpu()
-        plain, depth = SampleGrid(self.lens.pinhole), self._depth[-1].cpu()
+        step = view.step.match.on_cpu()
         good = step.sure()[0] & (self._information[-1].cpu() > 0)
-        T = pnp(plain, depth, step.pixels[0], good)
+        T = pnp(SampleGrid(self.lens.pinhole), self._depth[-1].cpu(), step.pixels[0], good)
         if T is None:
             return False
         self._views.append(view)
         self._T.append(T @ self._T[-1])
-        d, i = grid_fields(grid).transfer(T, self._depth[-1], self._information[-1])
-        self._depth.append(d)
-        self._information.append(i)
+        fields = grid_fields(self._pinhole)
+        depth, information = fields.transfer(T, self._depth[-1], self._information[-1])
+        self._depth.append(depth)
+        self._information.append(information)
         return True
 
     def measure(self, fine: bool, tick: Callable[[], None]) -> None:
@@ -110,10 +112,9 @@ class GrowingBundle:
             first, second = ([self._views[p[k]].encoded for p in chunk] for k in (0, 1))
             forward = torch.stack([where[p] for p in chunk])
             backward = torch.stack([where[p[::-1]] for p in chunk])
-            matches = self._operator.measure(first, second, forward, backward, fine=fine)
-            for m, match in enumerate(matches):
-                for k, p in enumerate(chunk):
-                    edge = p if m == 0 else p[::-1]
+            there, back = self._operator.measure(first, second, forward, backward, fine=fine)
+            for match, edges in ((there, chunk), (back, [p[::-1] for p in chunk])):
+                for k, edge in enumerate(edges):
                     self._edges[edge] = _Edge(match.pixels[k], match.weight[k], where[edge], fine)
 
     def _moved(
@@ -150,15 +151,18 @@ class GrowingBundle:
 
     def adjust(self) -> bool:
         """Solve for all unknowns and update the state; False if that fails."""
-        problem, asked = self.problem(), self._unknowns
+        unknowns = self._unknowns
+        problem = self.problem()
         problem = replace(problem, by_rows=self._by_rows(problem))
-        rolls = None if problem.by_rows is None else asked.readout is None
+        rolls = None if problem.by_rows is None else unknowns.readout is None
         pixels = self.grid.pixels.cpu()
-        block = LensBlock(self.lens, pixels, asked.focal, asked.radial, self.readout, rolls)
+        block = LensBlock(self.lens, pixels, unknowns.focal, unknowns.radial, self.readout, rolls)
         result = solve_shared(problem, block, PATIENT, LEAST_DECREASE)
         if not result.finite:
             return False
-        self.result, self.lens, self.readout = result, result.block.lens, result.block.readout
+        self.result = result
+        self.lens = result.block.lens
+        self.readout = result.block.readout
         self.residual = usual_residual(problem, result)
         self._T = list(result.T_cw)
         information = result.information.to(self.grid.device)
@@ -173,8 +177,10 @@ class GrowingBundle:
         images next to them; None for a global shutter, or where none of these is near enough."""
         if self._rows is None:
             return None
-        velocity, known = map(torch.stack, zip(*map(self._rows.velocity, self._views), strict=True))
-        rays, depth = SampleGrid(self.lens).rays, problem.inverse_depth
+        measured = [self._rows.motions.of(view.frame) for view in self._views]
+        velocity, known = map(torch.stack, zip(*measured, strict=True))
+        rays = SampleGrid(self.lens).rays
+        depth = problem.inverse_depth
         known = known.cpu() & (torch.stack(self._information).cpu() > 0)
         if not known.any():
             return None

@@ -40,7 +40,8 @@ class ImageMotions:
         self._grid = grid
         camera = grid.camera
         small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
-        self._size, self._factor = (small.width, small.height), small.width / camera.width
+        self._size = (small.width, small.height)
+        self._factor = small.width / camera.width
         column, row = ((grid.pixels.cpu().numpy() + 0.5) * self._factor - 0.5).round().astype(int).T
         self._cells = row.clip(0, small.height - 1), column.clip(0, small.width - 1)
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -71,9 +72,10 @@ class ImageMotions:
         return self._velocities[frame]
 
     def _measured(self, frame: int) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
-        grid, around = self._grid, self._beside[frame]
+        grid = self._grid
+        around = self._beside[frame]
         own = next(seen for seen in around if seen.frame == frame)
-        away = [(seen, seen.timestamp - own.timestamp) for seen in around if seen is not own]
+        away = [(seen, seen.timestamp - own.timestamp) for seen in around]
         beside = [(seen, seconds) for seen, seconds in away if 0 < abs(seconds) < FARTHEST]
         if not beside:
             return torch.zeros_like(grid.pixels), torch.zeros_like(grid.pixels[:, 0]).bool()

@@ -1,17 +1,10 @@
 """Unknown parameters of a camera before a run."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from geogs.bundle.row_motions import RowTimes
 from geogs.camera.shutter.rolling_camera import RollingCamera
-
-if TYPE_CHECKING:
-    from geogs.tracking.calibration.view_gatherer import View
+from geogs.tracking.calibration.image_motions import ImageMotions
 
 
 @dataclass(frozen=True)
@@ -33,5 +26,5 @@ class OpenRows:
     """Rows of a rolling shutter in images that were not rectified."""
 
     times: RowTimes
-    velocity: Callable[["View"], tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]]
-    """Returns velocities of a view's cells in pixels per second, and where they are known."""
+    motions: ImageMotions
+    """Velocities of the views' cells in the images."""

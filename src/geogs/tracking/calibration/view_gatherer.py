@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import TrackingConfig
@@ -12,12 +12,7 @@ from geogs.tracking.calibration.image_motions import ImageMotions, TimedImage
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
-from geogs.tracking.matching.flow_chain import (
-    MIN_MATCHED,
-    MIN_TEXTURE,
-    ChainedMatch,
-    follow_flow,
-)
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, ChainedMotion, follow_flow
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
@@ -33,7 +28,7 @@ class View:
     frame: int
     """Number of its image in the video."""
     encoded: Any
-    step: ChainedMatch | None
+    step: ChainedMotion | None
     """Flow between the keyframe before it and this one; None for the first."""
 
 
@@ -44,13 +39,15 @@ class ViewGatherer:
         self, images: Iterator[TimedImage], grid: SampleGrid, operator: FlowOperator
     ) -> None:
         """``images``: of the grid's size."""
-        self._images, self._grid, self._operator = images, grid, operator
+        self._images = images
+        self._grid = grid
+        self._operator = operator
         self._config = TrackingConfig()
         self._chain = ChainedPositions()
         self.frames = 0
         """Number of frames read so far."""
         self._is_read = False
-        self._motions = ImageMotions(grid)
+        self.motions = ImageMotions(grid)
 
     @property
     def is_over(self) -> bool:
@@ -71,30 +68,26 @@ class ViewGatherer:
             self.frames += 1
             tick()
             encoded = self._operator.encode(following.image)
-            self._motions.see(self.frames, following)
+            self.motions.see(self.frames, following)
             if self._operator.texture(encoded) < MIN_TEXTURE:
                 continue
             step = None
             if views:
-                match = follow_flow(
+                motion = follow_flow(
                     self._grid, self._operator, self._chain, views[-1].encoded, encoded
                 )
-                if match.matched < MIN_MATCHED:
+                if motion.overlap < MIN_MATCHED:
                     if len(views) >= count // 2:
                         break
                     views = []
-                elif not calls_for_keyframe(self._config, self._grid, match.seen):
+                elif not calls_for_keyframe(self._config, self._grid, motion):
                     continue
                 else:
-                    step = match
+                    step = motion
             self._chain.reset()
             views.append(View(self.frames, encoded, step))
-            self._motions.follow()
+            self.motions.follow()
         return views
-
-    def velocity(self, view: View) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
-        """Return velocities of a view's cells in pixels per second, and where they are known."""
-        return self._motions.of(view.frame)
 
 
 def flows_from_first(
@@ -106,7 +99,7 @@ def flows_from_first(
     flows = []
     for view in views[1:]:
         assert view.step is not None
-        there = there + grid.sample_field(filled_flow(grid, view.step.there), there)
+        there = there + grid.sample_field(filled_flow(grid, view.step.match), there)
         back_step = filled_positions(grid, view.step.back)
         back = back_step + grid.sample_field(back - grid.pixels, back_step)
         match, reverse = operator.measure(

@@ -120,8 +120,8 @@ __device__ __forceinline__ float2 limited_bend(float2 before, float2 a, float2 b
 }
 
 // Start flow at any pixel, zero on a cold start: linear between the cells, less what a quadratic
-// with the second differences around bends, see start_flow.py. The grid has four cells or more
-// across and down.
+// with the second differences around bends, see StartFlow in classical_flow.py. The grid has four
+// cells or more across and down.
 __device__ __forceinline__ float2 start_flow(const float2* start, int grid_width, int grid_height, float x, float y) {
   if (!start) return make_float2(0.f, 0.f);
   Linear u = linear_at((x - GRID_OFFSET) / GRID_STRIDE, grid_width);

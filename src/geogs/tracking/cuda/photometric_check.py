@@ -31,7 +31,8 @@ def median_correlation(
     at ``pixels``. Cells without information do not count, nor do windows whose smoothed variance in
     the first image is at most ``least_variance``. The result is float64 and stays on the GPU.
     """
-    c, device = grid.camera, first.device
+    c = grid.camera
+    device = first.device
     count = -(-grid.size // step)
     keys = torch.empty(count, dtype=torch.int32, device=device)
     found = torch.empty(2, dtype=torch.float64, device=device)

@@ -19,7 +19,12 @@ from torch import Tensor
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, SHARP, UNINFORMED
-from geogs.tracking.flow.classical_flow import COARSE_DEVIATION, MAX_DISAGREEMENT, SMALL_IMAGE
+from geogs.tracking.flow.classical_flow import (
+    COARSE_DEVIATION,
+    DEVIATION,
+    MAX_DISAGREEMENT,
+    SMALL_IMAGE,
+)
 from geogs.tracking.flow.flow_operator import Memories, check_image_size
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
@@ -29,8 +34,6 @@ TILE = 32
 """Edge in pixels of the tile of a block of the pyramid kernels."""
 PATCH = 8
 """Pixels along the edge of a patch."""
-PATCH_STRIDE = 4
-"""Pixels between patches."""
 REFINE_INNER = 24
 """Edge in pixels of the output of a block of the refinement."""
 MEAN_LEVEL = 3
@@ -39,25 +42,16 @@ LEVELS = 6
 """Levels of a pyramid, including the image itself."""
 PAIRS_AT_ONCE = 48
 """Pairs whose images and flows are in memory together."""
-DEVIATION = (0.06, 0.8, 3.4)
-"""Standard deviation of a match: constant (pixels), by disagreement, by roughness.
-
-As in :func:`geogs.tracking.flow.classical_flow.match_deviation`, fitted to this operator.
-"""
 WARM_LEVELS = 4
 """Pyramid levels searched where the start is right to a few pixels."""
 ITERATIONS = 6
 """Gauss-Newton steps of a patch."""
 COLD_REACHES = (4, 2, 1)
 """Distances, in patches, of neighbours whose motions a patch tries, pass by pass; cold starts."""
-REFINEMENTS = 5
-"""Linearisations of the variational refinement at the finest level."""
-COARSE_REFINEMENTS = 3
-"""Linearisations at the other levels."""
-SWEEPS = 10
-"""Relaxation sweeps of each at the finest level."""
-COARSE_SWEEPS = 20
-"""Relaxation sweeps at the other levels."""
+REFINEMENTS = (5, 3)
+"""Linearisations of the variational refinement at the finest level and at the others."""
+SWEEPS = (10, 20)
+"""Relaxation sweeps of each, the same way."""
 SMOOTHNESS = 10.0
 """Weight alpha of the smoothness term; less lets more noise in, more blurs depth steps."""
 GRADIENTS = 10.0
@@ -86,8 +80,7 @@ class _Layout:
     """Sizes of the levels and of the parts of an image's buffer."""
 
     def __init__(self, grid: SampleGrid) -> None:
-        self.width, self.height = grid.camera.width, grid.camera.height
-        self.sizes = [(self.width, self.height)]
+        self.sizes = [(grid.camera.width, grid.camera.height)]
         for _ in range(LEVELS - 1):
             w, h = self.sizes[-1]
             self.sizes.append(((w + 1) // 2, (h + 1) // 2))
@@ -96,10 +89,12 @@ class _Layout:
         self.means = w * h
         self.total = self.pyramid + self.means
         self.coarsest = max(k for k, size in enumerate(self.sizes) if min(size) >= PATCH or k == 0)
+        self.cells = (grid.width, grid.height)
 
     def patches(self, level: int) -> int:
         """Return the number of patches of a level."""
-        across, down = (-(-(n - PATCH) // PATCH_STRIDE) + 1 for n in self.sizes[level])
+        # One begins every four pixels.
+        across, down = (-(-(n - PATCH) // 4) + 1 for n in self.sizes[level])
         return across * down
 
 
@@ -116,19 +111,21 @@ class CudaClassicalFlow:
             self._kernels.update(loaded)
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> CudaImage:
-        layout, grid = self._layout, self.grid
+        layout = self._layout
+        grid = self.grid
         check_image_size(image, grid.camera)
         staged = torch.empty(image.shape, dtype=torch.uint8, pin_memory=self.device.type == "cuda")
         staged.numpy()[...] = image
         rgb = staged.to(self.device, non_blocking=True)
         data = torch.empty(layout.total, device=self.device)
         textured = torch.empty(1, dtype=torch.int32, device=self.device)
-        w, h = layout.width, layout.height
-        self._kernels["flow_grey"](_tiles(w, h), (TILE, 8), rgb, data, textured, w, h, LEVELS)
-        self._kernels["flow_structure"](
-            -(-(grid.size + layout.means) // 8), (32, 8), data, textured, w, h,
-            grid.width, grid.height, layout.pyramid, MIN_STRUCTURE,
-        )  # fmt: skip
+        size = layout.sizes[0]
+        self._kernels["flow_grey"](
+            _blocks(size, TILE), (TILE, 8), rgb, data, textured, *size, LEVELS
+        )
+        count = -(-(grid.size + layout.means) // 8)
+        sizes = (*size, *layout.cells, layout.pyramid)
+        self._kernels["flow_structure"](count, (32, 8), data, textured, *sizes, MIN_STRUCTURE)
         return CudaImage(data, textured)
 
     def texture(self, encoded: CudaImage) -> float:
@@ -165,8 +162,10 @@ class CudaClassicalFlow:
     def _measure(
         self, images: Sequence[CudaImage], start: tuple[Tensor, Tensor] | None, finest: int
     ) -> tuple[Float[Tensor, "2 e p 2"], Float[Tensor, "2 e p 2"]]:
-        layout, grid, pairs = self._layout, self.grid, len(images) // 2
-        w, h = layout.width, layout.height
+        layout = self._layout
+        grid = self.grid
+        pairs = len(images) // 2
+        size = layout.sizes[0]
         pointers = torch.tensor([image.data.data_ptr() for image in images])
         table = to_device(pointers, self.device)
         forward, backward = (None, None) if start is None else start
@@ -174,18 +173,19 @@ class CudaClassicalFlow:
         flow = self._coarse_to_fine(table, warped, start is None, finest)
         width, height = layout.sizes[finest]
         found = torch.empty(2 * pairs, height, width, device=self.device)
+        blocks = (*_blocks(layout.sizes[finest], 32, 8), 2 * pairs)
         self._kernels["flow_found"](
-            (-(-width // 32), -(-height // 8), 2 * pairs), (32, 8), warped, flow, found,
-            layout.pyramid, w, h, finest,
-        )  # fmt: skip
+            blocks, (32, 8), warped, flow, found, layout.pyramid, *size, finest
+        )
         pixels = torch.empty(2, pairs, grid.size, 2, device=self.device)
         weight = torch.empty_like(pixels)
         scale = COARSE_DEVIATION if finest else 1.0
+        limits = (SHARP, UNINFORMED, MAX_DISAGREEMENT, *(scale * d for d in DEVIATION))
+        given = (table, flow, forward, backward, found)
+        cells = (-(-grid.size // 8), 2 * pairs)
         self._kernels["flow_match"](
-            (-(-grid.size // 8), 2 * pairs), (32, 8), table, flow, forward, backward, found,
-            pixels, weight, pairs, w, h, grid.width, grid.height, finest, SHARP, UNINFORMED,
-            MAX_DISAGREEMENT, *(scale * d for d in DEVIATION),
-        )  # fmt: skip
+            cells, (32, 8), *given, pixels, weight, pairs, *size, *layout.cells, finest, *limits
+        )
         return pixels, weight
 
     def _warped(
@@ -195,29 +195,30 @@ class CudaClassicalFlow:
         backward: Float[Tensor, "e p 2"] | None,
     ) -> Float[Tensor, "d n"]:
         """Return pyramids of the second images, warped and with the first images' brightness."""
-        layout, grid, directed = self._layout, self.grid, len(table)
-        w, h, stride = layout.width, layout.height, layout.pyramid
+        layout = self._layout
+        directed = len(table)
+        size = layout.sizes[0]
+        stride = layout.pyramid
         warped = torch.empty(directed, stride, device=self.device)
         gain = torch.empty(directed, layout.means, device=self.device)
+        blocks = (*_blocks(size, TILE), directed)
+        sizes = (directed // 2, stride, *size, *layout.cells)
         self._kernels["flow_warp"](
-            (*_tiles(w, h), directed), (TILE, 8), table, forward, backward, warped,
-            directed // 2, stride, w, h, grid.width, grid.height, LEVELS,
-        )  # fmt: skip
-        self._kernels["flow_gain"](
-            (-(-layout.means // 8), directed), (32, 8), table, warped, gain, stride, w, h,
-            layout.pyramid,
-        )  # fmt: skip
-        self._kernels["flow_brighten"](
-            (-(-stride // 256), directed), 256, warped, gain, stride, w, h, LEVELS
+            blocks, (TILE, 8), table, forward, backward, warped, *sizes, LEVELS
         )
+        means = (-(-layout.means // 8), directed)
+        self._kernels["flow_gain"](means, (32, 8), table, warped, gain, stride, *size, stride)
+        pixels = (-(-stride // 256), directed)
+        self._kernels["flow_brighten"](pixels, 256, warped, gain, stride, *size, LEVELS)
         return warped
 
     def _coarse_to_fine(
         self, table: Int[Tensor, "d"], warped: Float[Tensor, "d n"], cold: bool, finest: int
     ) -> Float[Tensor, "d q 2"]:
         """Compute dense flow at level ``finest``, row by row, in its pixels."""
-        layout, directed = self._layout, len(table)
-        w, h, stride = layout.width, layout.height, layout.pyramid
+        layout = self._layout
+        directed = len(table)
+        sizes = (layout.pyramid, *layout.sizes[0])
         coarsest = layout.coarsest if cold else min(WARM_LEVELS - 1, layout.coarsest)
         flow: Tensor | None = None
         for level in range(coarsest, finest - 1, -1):
@@ -226,21 +227,20 @@ class CudaClassicalFlow:
             patches: Tensor | None = None
             for reach in (0, *(COLD_REACHES if cold else ())):
                 found = torch.empty(directed, count, 2, device=self.device)
-                self._kernels["flow_search"](
-                    (-(-count * PATCH // 256), directed), 256, table, warped, flow, patches, found,
-                    stride, w, h, level, reach, ITERATIONS,
-                )  # fmt: skip
+                images = (table, warped, flow, patches)
+                settings = (level, reach, ITERATIONS)
+                blocks = (-(-count * PATCH // 256), directed)
+                self._kernels["flow_search"](blocks, 256, *images, found, *sizes, *settings)
                 patches = found
             flow = torch.empty(directed, width * height, 2, device=self.device)
             other = torch.empty_like(flow)
+            tiles = (*_blocks(layout.sizes[level], 32, 8), directed)
             self._kernels["flow_densify"](
-                (-(-width // 32), -(-height // 8), directed), (32, 8), table, warped, patches,
-                flow, stride, w, h, level,
-            )  # fmt: skip
-            last = level == finest
-            sweeps = SWEEPS if last else COARSE_SWEEPS
-            for _ in range(REFINEMENTS if last else COARSE_REFINEMENTS):
-                self._refine(table, warped, flow, other, level, sweeps)
+                tiles, (32, 8), table, warped, patches, flow, *sizes, level
+            )
+            is_coarse = level > finest
+            for _ in range(REFINEMENTS[is_coarse]):
+                self._refine(table, warped, flow, other, level, SWEEPS[is_coarse])
                 flow, other = other, flow
         assert flow is not None
         return flow
@@ -249,14 +249,14 @@ class CudaClassicalFlow:
         self, table: Tensor, warped: Tensor, flow: Tensor, refined: Tensor, level: int, sweeps: int
     ) -> None:
         layout = self._layout
-        width, height = layout.sizes[level]
-        blocks = (-(-width // REFINE_INNER), -(-height // REFINE_INNER), len(table))
+        blocks = (*_blocks(layout.sizes[level], REFINE_INNER), len(table))
+        sizes = (layout.pyramid, *layout.sizes[0], level)
+        weights = (SMOOTHNESS, GRADIENTS, BRIGHTNESS, ZETA**2, EPSILON**2, RELAXATION)
         self._kernels["flow_refine"](
-            blocks, (32, 8), table, warped, flow, refined, layout.pyramid, layout.width,
-            layout.height, level, sweeps, SMOOTHNESS, GRADIENTS, BRIGHTNESS,
-            ZETA**2, EPSILON**2, RELAXATION,
-        )  # fmt: skip
+            blocks, (32, 8), table, warped, flow, refined, *sizes, sweeps, *weights
+        )
 
 
-def _tiles(width: int, height: int) -> tuple[int, int]:
-    return -(-width // TILE), -(-height // TILE)
+def _blocks(size: tuple[int, int], width: int, height: int | None = None) -> tuple[int, int]:
+    """Return how many blocks of ``width`` x ``height`` (default: square) cover an image."""
+    return -(-size[0] // width), -(-size[1] // (height or width))

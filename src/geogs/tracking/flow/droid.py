@@ -24,25 +24,11 @@ from torch import Tensor
 
 from geogs.gpu.transfer import to_device, upload
 from geogs.tracking.flow.cell_texture import cell_structure
-from geogs.tracking.flow.correlation import CorrelationVolume
-from geogs.tracking.flow.droid_network import (
-    CORRELATION_SCALE,
-    LEVELS,
-    RADIUS,
-    DroidNetwork,
-    motion_features,
-    on_cells,
-)
+from geogs.tracking.flow.droid_network import DroidNetwork, motion_features, on_cells
 from geogs.tracking.flow.flow_operator import Memories, check_image_size
+from geogs.tracking.flow.lookup import CorrelationVolume
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-
-FAR = 1e4
-"""Limit of positions, in cells."""
-WEIGHT_SCALE = 0.001
-"""DROID-SLAM's factor on the weights."""
-DAMPING_FACTOR, DAMPING_FLOOR = 0.2, 1e-7
-"""DROID-SLAM's factor on the damping, and the constant that it adds."""
 
 
 @dataclass(frozen=True)
@@ -100,15 +86,15 @@ class DroidFlow:
 
     @torch.no_grad()
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> DroidImage:
+        check_image_size(image, self.grid.camera)
+        rgb = upload(image, self.device).permute(2, 0, 1)[None]
         with self._precision():
-            shown = self._shown(image)
+            shown = on_cells(rgb.float() / 255)
             features = self.network.features(shown)
             hidden, static = self.network.context(shown)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        kept = upload(grey, self.device)
-        return DroidImage(
-            features[0], hidden[0], static[0], kept, cell_structure(grey).textured_fraction
-        )
+        textured = cell_structure(grey).textured_fraction
+        return DroidImage(features[0], hidden[0], static[0], upload(grey, self.device), textured)
 
     def texture(self, encoded: DroidImage) -> float:
         return encoded.texture
@@ -126,10 +112,10 @@ class DroidFlow:
         fine: bool = True,
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
-        source, target = [*first, *second], [*second, *first]
-        before: list[DroidMemory | None] = [None] * len(source)
-        if memory is not None:
-            before = [pair[way] for way in (0, 1) for pair in memory]
+        source = [*first, *second]
+        target = [*second, *first]
+        known = memory or [(None, None)] * len(first)
+        before: list[DroidMemory | None] = [pair[way] for way in (0, 1) for pair in known]
         updates = self.options.fine_updates if fine else self.options.updates
         if forward is None or backward is None:
             updates = self.options.cold_updates
@@ -156,11 +142,6 @@ class DroidFlow:
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.float16, enabled=self.grid.on_gpu)
 
-    def _shown(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "1 3 h8 w8"]:
-        check_image_size(image, self.grid.camera)
-        rgb = upload(image, self.device).permute(2, 0, 1)[None]
-        return on_cells(rgb.float() / 255)
-
     def _revise(
         self,
         source: Sequence[DroidImage],
@@ -176,7 +157,7 @@ class DroidFlow:
         shape = (len(source), self.grid.height, self.grid.width, 2)
         position = (start.reshape(shape) - OFFSET) / STRIDE
         # Points close to or behind the second camera can project anywhere.
-        position = position.nan_to_num(FAR).clamp(-FAR, FAR)
+        position = position.nan_to_num(1e4).clamp(-1e4, 1e4)
         hidden = torch.stack(
             [s.hidden if m is None else m.hidden for s, m in zip(source, before, strict=True)]
         )
@@ -187,12 +168,13 @@ class DroidFlow:
         weight = torch.zeros_like(position)
         with self._precision():
             a, b = (torch.stack([image.features for image in x]) for x in (source, target))
-            lookup = CorrelationVolume(a, b, LEVELS, RADIUS, CORRELATION_SCALE)
+            lookup = CorrelationVolume(a, b)
             for _ in range(updates):
                 out = self.network.update(
                     hidden, static, lookup(position), motion_features(position, last)
                 )
-                hidden, weight = out.hidden, out.weight.permute(0, 2, 3, 1).float()
+                hidden = out.hidden
+                weight = out.weight.permute(0, 2, 3, 1).float()
                 # The best guess of the reprojection after an adjustment.
                 position = last = position + out.delta.permute(0, 2, 3, 1).float()
         return hidden, position, weight
@@ -201,13 +183,13 @@ class DroidFlow:
         self, source: Sequence[DroidImage], hidden: Float[Tensor, "d c h w"]
     ) -> Float[Tensor, "d p"]:
         """Return damping of the inverse depth of each edge's source, from its outgoing edges."""
-        number: dict[int, int] = {}
-        place = [number.setdefault(id(image), len(number)) for image in source]
-        index = to_device(torch.tensor(place), self.device)
+        slot: dict[int, int] = {}
+        slots = [slot.setdefault(id(image), len(slot)) for image in source]
+        index = to_device(torch.tensor(slots), self.device)
         with self._precision():
             eta = self.network.update.agg(hidden, index).float()
-        factor = STRIDE**2 / (WEIGHT_SCALE * self.options.deviation**2)
-        return factor * (DAMPING_FACTOR * eta.flatten(1) + DAMPING_FLOOR)[index]
+        factor = STRIDE**2 / (0.001 * self.options.deviation**2)
+        return factor * (0.2 * eta.flatten(1) + 1e-7)[index]
 
     def _weighed(
         self, position: Float[Tensor, "d h w 2"], confidence: Float[Tensor, "d h w 2"]

@@ -15,22 +15,10 @@ from torch.nn import functional as F
 
 from geogs.documents import in_short
 from geogs.errors import InputError
+from geogs.tracking.flow.lookup import VOLUME_LEVELS, WINDOW
+from geogs.tracking.flow.network_parts import cell_positions, two_convolutions
 from geogs.world.grid import OFFSET, STRIDE
 
-LEVELS = 4
-"""Levels of the correlation pyramid."""
-RADIUS = 3
-"""Radius in cells of a lookup window on each level."""
-LOOKUP = LEVELS * (2 * RADIUS + 1) ** 2
-"""Channels of a lookup."""
-CORRELATION_SCALE = 1 / 16
-"""Factor on the products of features."""
-MOTION_LIMIT = 64.0
-"""Largest motion in the network's input, in cells."""
-DAMPING_SCALE = 0.01
-"""Factor on the softplus that gives the damping."""
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Mean and deviation of red, green and blue of the public encoders' training images, in [0, 1]."""
 TRIMMED = tuple(
     f"update.{head}.2.{kind}" for head in ("weight", "delta") for kind in ("weight", "bias")
 )
@@ -51,8 +39,9 @@ def on_cells(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h8 w8"]:
 
 
 def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Normalise RGB in [0, 1] for the encoders."""
-    mean, deviation = (images.new_tensor(c)[:, None, None] for c in (MEAN, DEVIATION))
+    """Normalise RGB in [0, 1] by the mean and deviation of the encoders' training images."""
+    mean = images.new_tensor([0.485, 0.456, 0.406])[:, None, None]
+    deviation = images.new_tensor([0.229, 0.224, 0.225])[:, None, None]
     return (images - mean) / deviation
 
 
@@ -140,13 +129,13 @@ class GraphAggregation(nn.Module):
         self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]
     ) -> Float[Tensor, "n h w"]:
         """Return the damping of inverse depth of each source, ascending; in the network's units."""
-        frames, place, count = source.unique(return_inverse=True, return_counts=True)
+        frames, slot, count = source.unique(return_inverse=True, return_counts=True)
         edges = F.relu(self.conv1(hidden))
         # A product, not scattered sums: the order is fixed, and sums are in single precision.
-        fraction = F.one_hot(place, len(frames)).mT / count[:, None]
+        fraction = F.one_hot(slot, len(frames)).mT / count[:, None]
         mean = (fraction.to(edges) @ edges.flatten(1)).unflatten(1, edges.shape[1:])
         joined = F.relu(self.conv2(mean))
-        return DAMPING_SCALE * self.eta(joined)[:, 0]
+        return 0.01 * self.eta(joined)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -166,21 +155,13 @@ class UpdateOperator(nn.Module):
     def __init__(self, hidden: int, motion: int) -> None:
         """Arguments: channels of the hidden state, and of the encoded motion."""
         super().__init__()
-        self.corr_encoder = nn.Sequential(
-            nn.Conv2d(LOOKUP, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 3, 1, 1), nn.ReLU()
-        )
-        self.flow_encoder = nn.Sequential(
-            nn.Conv2d(4, hidden, 7, 1, 3), nn.ReLU(), nn.Conv2d(hidden, motion, 3, 1, 1), nn.ReLU()
-        )
+        windows = VOLUME_LEVELS * WINDOW
+        self.corr_encoder = two_convolutions(windows, hidden, hidden, 1, 3, nn.ReLU())
+        self.flow_encoder = two_convolutions(4, hidden, motion, 7, 3, nn.ReLU())
         self.gru = ConvGru(hidden, 2 * hidden + motion)
-        self.delta = nn.Sequential(*self._head(hidden))
-        self.weight = nn.Sequential(*self._head(hidden), nn.Sigmoid())
+        self.delta = two_convolutions(hidden, hidden, 2, 3, 3)
+        self.weight = two_convolutions(hidden, hidden, 2, 3, 3, nn.Sigmoid())
         self.agg = GraphAggregation(hidden)
-
-    @staticmethod
-    def _head(hidden: int) -> list[nn.Module]:
-        first, second = nn.Conv2d(hidden, hidden, 3, 1, 1), nn.Conv2d(hidden, 2, 3, 1, 1)
-        return [first, nn.ReLU(), second]
 
     def forward(
         self,
@@ -190,8 +171,8 @@ class UpdateOperator(nn.Module):
         motion: Float[Tensor, "e 4 h w"],
     ) -> EdgeOutput:
         """``correlation`` at the present positions, ``motion`` of :func:`motion_features`."""
-        seen = [static, self.corr_encoder(correlation), self.flow_encoder(motion)]
-        hidden = self.gru(hidden, torch.cat(seen, 1))
+        inputs = [static, self.corr_encoder(correlation), self.flow_encoder(motion)]
+        hidden = self.gru(hidden, torch.cat(inputs, 1))
         return EdgeOutput(hidden, self.delta(hidden), self.weight(hidden))
 
 
@@ -218,26 +199,15 @@ class DroidNetwork(nn.Module):
         return hidden.tanh(), F.relu(static)
 
 
-def cell_positions(
-    height: int, width: int, device: torch.device | str = "cpu"
-) -> Float[Tensor, "h w 2"]:
-    """Return x, y of every cell."""
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=torch.float32, device=device),
-        torch.arange(width, dtype=torch.float32, device=device),
-        indexing="ij",
-    )
-    return torch.stack([x, y], -1)
-
-
 def motion_features(
     position: Float[Tensor, "e h w 2"], target: Float[Tensor, "e h w 2"]
 ) -> Float[Tensor, "e 4 h w"]:
-    """Return the flow at the present position, and its offset to the last target; in cells."""
+    """Return the flow at the present position, and its offset to the last target; in cells, at most
+    64."""
     height, width = position.shape[1:3]
-    flow = position - cell_positions(height, width, position.device)
+    flow = position - cell_positions(height, width, position)
     both = torch.cat([flow, target - position], -1)
-    return both.clamp(-MOTION_LIMIT, MOTION_LIMIT).permute(0, 3, 1, 2)
+    return both.clamp(-64.0, 64.0).permute(0, 3, 1, 2)
 
 
 def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:
@@ -251,6 +221,6 @@ def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:
     try:
         network.load_state_dict(plain)
     except RuntimeError as error:
-        said = str(error).partition("\n")[2] or str(error)
-        raise InputError(f"These are not the weights of DROID-SLAM: {in_short(said)}") from error
+        reason = str(error).partition("\n")[2] or str(error)
+        raise InputError(f"These are not the weights of DROID-SLAM: {in_short(reason)}") from error
     return network.eval().requires_grad_(False)

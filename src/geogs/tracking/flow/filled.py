@@ -15,5 +15,6 @@ def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]
 
 def filled_flow(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
     """Return flow of a single edge, unmatched cells filled in from around them."""
-    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
+    flow = match.pixels[0] - grid.pixels
+    weight = match.weight[0, :, 0]
     return grid_fields(grid).fill(flow.mT, weight.expand(2, -1)).mT.contiguous()

@@ -1,7 +1,8 @@
-"""Correlation windows around estimated positions of cells, without a correlation volume.
+"""Correlation windows around estimated positions of cells, in two ways.
 
-Every cell of the first image has one descriptor; the second image has descriptors on a pyramid of
-grids, some finer than the cells, so that a position can be estimated to a fraction of a pixel.
+Our network has one descriptor for every cell of the first image; the second image has descriptors
+on a pyramid of grids, some finer than the cells, so that a position can be estimated to a fraction
+of a pixel. DROID-SLAM's reads a correlation volume (:class:`CorrelationVolume`).
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ WINDOW = (2 * RADIUS + 1) ** 2
 """Number of values of a window, row by row."""
 CHANNELS = 64
 """Channels of a descriptor; in the GPU's kernel each lane of a warp has two."""
+VOLUME_LEVELS = 4
+"""Levels of the pyramid of a correlation volume."""
 _WARPS = 8
 
 
@@ -101,7 +104,7 @@ def correlation_windows_reference(
 def _compiled_windows(
     source: Tensor, pyramid: DescriptorPyramid, edges: Edges, centres: Tensor
 ) -> Tensor:
-    from geogs.tracking.flow.lookup_kernels import lookup_windows
+    from geogs.tracking.flow.flow_kernels import lookup_windows
 
     mine, theirs = (x.float().numpy() for x in (source, pyramid.descriptors))
     points = centres.float().contiguous().numpy()
@@ -141,7 +144,9 @@ class _CudaWindows(torch.autograd.Function):
         grid = (-(-cells // _WARPS), levels, count)
         kernels_for(SOURCE, device)["lookup_windows"](grid, (32, _WARPS), *common, out, *sizes)
         ctx.save_for_backward(*common)
-        ctx.sizes, ctx.grid, ctx.types = sizes, grid, (source.dtype, descriptors.dtype)
+        ctx.sizes = sizes
+        ctx.grid = grid
+        ctx.types = (source.dtype, descriptors.dtype)
         return out
 
     @staticmethod
@@ -178,3 +183,73 @@ def _tables_on(device: torch.device, levels: tuple[PyramidLevel, ...]) -> tuple[
 def _pairs(descriptors: Float[Tensor, "n q c"]) -> Int[Tensor, "n q c2"]:
     """Round descriptors to bfloat16, two in an int32."""
     return descriptors.detach().to(torch.bfloat16).contiguous().view(torch.int32)
+
+
+class CorrelationVolume:
+    """All-pairs correlation of two feature maps, as in DROID-SLAM (after RAFT).
+
+    It is computed once and read many times: 16 h^2 w^2 / 3 bytes a pair. All-pairs products of the
+    features, averaged over 2 x 2, 4 x 4, ... pixels of the second map, are read in a square window
+    around a position (Teed & Deng, "RAFT: Recurrent All-Pairs Field Transforms for Optical Flow",
+    ECCV 2020, section 3.2).
+
+    Conventions, which are those of the published networks:
+
+    - products are divided by 16;
+    - positions are in pixels of the feature maps, x before y, pixel centres at integers;
+    - on level l of the pyramid they are divided by 2^l only (the network has to learn the
+      half-pixel shift of the centres of averaged pixels);
+    - beyond the border the correlation is zero;
+    - the channels are ordered by level, then x offset, then y offset: channel
+      ``(7 l + i) 7 + j`` is at (x + i - 3, y + j - 3).
+    """
+
+    def __init__(self, first: Float[Tensor, "b d h w"], second: Float[Tensor, "b d h w"]) -> None:
+        """Multiply all pairs of features: those of the pixels that are looked up, and those of the
+        images they are looked for in."""
+        # Half of the factor on each side: products of half-precision features stay in range.
+        a, b = (first / 4).flatten(2), (second / 4).flatten(2)
+        self._levels = [(a.mT @ b).reshape(-1, 1, *second.shape[-2:])]
+        for _ in range(VOLUME_LEVELS - 1):
+            self._levels.append(_halved(self._levels[-1]))
+
+    def __call__(self, coords: Float[Tensor, "b h w 2"]) -> Float[Tensor, "b c h w"]:
+        windows = [
+            _window(level.flatten(1), level.shape[-2:], coords / 2**k)
+            for k, level in enumerate(self._levels)
+        ]
+        return torch.cat(windows, 1)
+
+
+def _halved(image: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h2 w2"]:
+    """Return means over 2 x 2 pixels; of size zero where there are none."""
+    height, width = image.shape[-2:]
+    if min(height, width) < 2:
+        return image.new_zeros(*image.shape[:2], height // 2, width // 2)
+    return functional.avg_pool2d(image, 2)
+
+
+def _window(
+    products: Float[Tensor, "n q"], size: torch.Size, coords: Float[Tensor, "b h w 2"]
+) -> Float[Tensor, "b c h w"]:
+    """Read a bilinear window of each row of products, an image of this size; zero outside.
+
+    All positions of a window have the same fraction, so values at 8 x 8 whole pixels are enough.
+    """
+    height, width = size
+    if not height or not width:
+        return coords.new_zeros(len(coords), WINDOW, *coords.shape[1:3], dtype=torch.float32)
+    # Far away (or NaN) is equivalent to just outside.
+    limit = coords.new_tensor([width, height]) + RADIUS + 1
+    near = coords.float().nan_to_num(-1e6).clamp(min=-RADIUS - 2.0).minimum(limit.float())
+    corner = near.floor()
+    fx, fy = ((near - corner)[..., None, None, k] for k in (0, 1))
+    steps = torch.arange(-RADIUS, RADIUS + 2, device=coords.device)
+    x, y = (corner[..., None, k].long() + steps for k in (0, 1))
+    inside = ((x >= 0) & (x < width))[..., :, None] & ((y >= 0) & (y < height))[..., None, :]
+    index = y.clamp(0, height - 1)[..., None, :] * width + x.clamp(0, width - 1)[..., :, None]
+    values = products.gather(1, index.reshape(len(products), -1)).reshape(index.shape)
+    values = torch.where(inside, values.float(), 0.0)
+    values = values[..., :-1, :] * (1 - fx) + values[..., 1:, :] * fx
+    values = values[..., :-1] * (1 - fy) + values[..., 1:] * fy
+    return values.flatten(3).permute(0, 3, 1, 2)

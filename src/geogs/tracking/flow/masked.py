@@ -47,17 +47,15 @@ class MaskedFlow:
     """Wraps an operator; matches from and to masked-out pixels get no weight."""
 
     def __init__(
-        self,
-        operator: FlowOperator,
-        grid: SampleGrid,
-        mask: Bool[np.ndarray, "h w"] | None = None,
+        self, operator: FlowOperator, grid: SampleGrid, mask: Bool[np.ndarray, "h w"] | None = None
     ) -> None:
         """``mask``, of the size of the images, is true where all of them show the scene (not a
         car's bonnet, an arm, a time stamp); None masks out black pixels of each image.
 
         Raises InputError if it has another size, or hides all.
         """
-        self._operator, self._device = operator, grid.device
+        self._operator = operator
+        self._device = grid.device
         self._x, self._y = grid.pixels.long().unbind(-1)
         self.fixed: ValidMask | None = None
         """Mask of all images."""
@@ -112,11 +110,10 @@ class MaskedFlow:
         height, width = target[0].valid.pixels.shape
         x, y = match.pixels.nan_to_num(0.0, 0.0, 0.0).round().long().unbind(-1)
         x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
-        if self.fixed:
-            valid = self.fixed.cells * self.fixed.pixels[y, x]
-        else:
-            valid = torch.stack([
+        valid = torch.stack(
+            [
                 a.valid.cells * b.valid.pixels[v, u]
                 for a, b, u, v in zip(source, target, x, y, strict=True)
-            ])  # fmt: skip
+            ]
+        )
         return replace(match, weight=match.weight * valid[..., None].to(match.weight))

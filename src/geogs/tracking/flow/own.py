@@ -58,8 +58,8 @@ class OwnFlowOptions:
 class OwnImage:
     """An image encoded by the network, on the device of the grid."""
 
-    features: FlowFeatures
-    """Features of one image."""
+    features: Maps
+    """Those of :class:`FlowFeatures`, without the levels of the pyramid."""
     classical: Any
     """The image encoded by the classical operator."""
 
@@ -97,10 +97,7 @@ class OwnFlow:
     @torch.inference_mode()
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> OwnImage:
         check_image_size(image, self.grid.camera)
-        pixels = upload(image, self.device)
-        source, descriptors, hidden, context = self._encoded(pixels)
-        pyramid = DescriptorPyramid(descriptors, self._levels)
-        features = FlowFeatures(source, pyramid, hidden, context)
+        features = self._encoded(upload(image, self.device))
         return OwnImage(features, self.classical.encode(image))
 
     def _features(self, pixels: UInt8[Tensor, "h w 3"]) -> Maps:
@@ -126,7 +123,8 @@ class OwnFlow:
         fine: bool = True,
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
-        options, pairs = self.options, len(first)
+        options = self.options
+        pairs = len(first)
         images = list({id(i): i for i in (*first, *second)}.values())
         slot = {id(image): n for n, image in enumerate(images)}
         a, b = ([slot[id(i)] for i in side] for side in (first, second))
@@ -139,19 +137,14 @@ class OwnFlow:
             iterations = options.warm_iterations if fine else options.coarse_iterations
         # Each frame measures one pair; larger numbers of pairs vary.
         refined = self._refined(iterations, is_warm, pairs == 1)
-        f = _stack([i.features for i in images])
+        features = [torch.cat(m) for m in zip(*(i.features for i in images), strict=True)]
         source, target = (
             to_device(torch.tensor(x), self.device, torch.int32) for x in ([*a, *b], [*b, *a])
         )
         parts = []
         for at in range(0, 2 * pairs, options.edges_at_once):
             part = slice(at, at + options.edges_at_once)
-            parts.append(
-                refined(
-                    f.source, f.pyramid.descriptors, f.hidden, f.context, source[part],
-                    target[part], start[part],
-                )
-            )  # fmt: skip
+            parts.append(refined(*features, source[part], target[part], start[part]))
         pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
         if options.polish:
             pixels, weight = self._polished(first, second, pixels, weight, fine, is_warm)
@@ -164,10 +157,8 @@ class OwnFlow:
         and the start of each.
         """
 
-        def work(
-            source: Tensor, descriptors: Tensor, hidden: Tensor, context: Tensor,
-            first: Tensor, second: Tensor, start: Tensor,
-        ) -> Maps:  # fmt: skip
+        def work(*given: Tensor) -> Maps:
+            source, descriptors, hidden, context, first, second, start = given
             pyramid = DescriptorPyramid(descriptors, self._levels)
             features = FlowFeatures(source, pyramid, hidden, context)
             with self._autocast():
@@ -222,7 +213,8 @@ class OwnFlow:
     ) -> Float[Tensor, "e p 2"]:
         """Return the inverse variance of matched cells; zero where a match is unlikely, outside the
         image, or moves differently from the others after a warm start."""
-        options, error = self.options, estimate.error
+        options = self.options
+        error = estimate.error
         deviation = 2**0.5 * error.log_scale.exp().amax(-1)
         good = (deviation < options.max_deviation) & self.grid.inside(estimate.pixels)
         good &= error.logit[..., 0].sigmoid() > options.min_probability
@@ -235,16 +227,3 @@ class OwnFlow:
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16)
-
-
-def _stack(parts: Sequence[FlowFeatures]) -> FlowFeatures:
-    """Concatenate the features of several images."""
-    if len(parts) == 1:
-        return parts[0]
-    descriptors = torch.cat([p.pyramid.descriptors for p in parts])
-    return FlowFeatures(
-        torch.cat([p.source for p in parts]),
-        DescriptorPyramid(descriptors, parts[0].pyramid.levels),
-        torch.cat([p.hidden for p in parts]),
-        torch.cat([p.context for p in parts]),
-    )

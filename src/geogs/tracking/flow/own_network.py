@@ -24,13 +24,12 @@ from geogs.tracking.flow.lookup import (
     PyramidLevel,
     correlation_windows,
 )
+from geogs.tracking.flow.network_parts import cell_pixels, two_convolutions
 from geogs.tracking.flow.own_options import NetworkOptions
-from geogs.world.grid import OFFSET, STRIDE
+from geogs.world.grid import STRIDE
 
 FLOW_UNIT = 16.0
 """Pixels per unit of flow in the network."""
-MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
-"""Bounds of the logarithm of a matched cell's Laplace scale in pixels."""
 
 
 @dataclass(frozen=True)
@@ -93,29 +92,22 @@ class FlowNetwork(nn.Module):
         self.options = options or NetworkOptions()
         self.encoder = FlowEncoder(self.options)
         self.update = FlowUpdate(self.options)
-        self.upsampling = nn.Sequential(
-            nn.Conv2d(self.options.hidden, 80, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(80, 9 * STRIDE * STRIDE, 1),
-        )
+        self.upsampling = two_convolutions(self.options.hidden, 80, 9 * STRIDE * STRIDE, 3, 1)
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> FlowFeatures:
         """Compute features of RGB images in [0, 1], on the cells of :class:`SampleGrid`."""
         return self.encoder(images)
 
     def iterate(
-        self,
-        features: FlowFeatures,
-        edges: Edges,
-        start: Float[Tensor, "e p 2"],
-        iterations: int,
+        self, features: FlowFeatures, edges: Edges, start: Float[Tensor, "e p 2"], iterations: int
     ) -> Iterator[FlowEstimate]:
         """Yield estimates of the positions of each edge's first cells in its second image, pixels.
 
         ``start``: initial positions. Positions are detached between iterations.
         """
         first = edges.first.long()
-        state, context = features.hidden[first], features.context[first]
+        state = features.hidden[first]
+        context = features.context[first]
         height, width = state.shape[-2:]
         cells = cell_pixels(height, width, start)
         pixels = start
@@ -144,9 +136,10 @@ class FlowNetwork(nn.Module):
         weight = logits.reshape(len(flow), 1, 9, STRIDE, STRIDE, gh, gw).softmax(2)
         full = (weight * near).sum(2).permute(0, 4, 2, 5, 3, 1)
         full = full.reshape(len(flow), gh * STRIDE, gw * STRIDE, 2)
-        if full.shape[1] < height or full.shape[2] < width:
-            pad = (0, 0, 0, max(0, width - full.shape[2]), 0, max(0, height - full.shape[1]))
-            full = _replicated(full, pad)
+        beyond = (0, max(0, width - full.shape[2]), 0, max(0, height - full.shape[1]))
+        if any(beyond):
+            full = functional.pad(full.permute(0, 3, 1, 2), beyond, mode="replicate")
+            full = full.permute(0, 2, 3, 1)
         return full[:, :height, :width]
 
 
@@ -180,27 +173,23 @@ class FlowEncoder(nn.Module):
         self.describe_cells = nn.Conv2d(o.deep, CHANNELS, 1)
         self.deep_to_quarter = nn.ConvTranspose2d(o.deep, o.middle, 3, stride=2)
         self.describe_quarter = nn.Sequential(
-            nn.ReLU(), nn.Conv2d(o.middle, o.middle, 3, padding=1), nn.ReLU(),
-            nn.Conv2d(o.middle, CHANNELS, 1),
-        )  # fmt: skip
+            nn.ReLU(), *two_convolutions(o.middle, o.middle, CHANNELS, 3, 1)
+        )
         if 2 in o.levels:
             self.quarter_to_half = nn.ConvTranspose2d(
                 o.middle, o.stem, 3, stride=2, padding=1, output_padding=1
             )
             self.describe_half = nn.Sequential(
-                nn.ReLU(), nn.Conv2d(o.stem, o.stem, 3, padding=1), nn.ReLU(),
-                nn.Conv2d(o.stem, CHANNELS, 1),
-            )  # fmt: skip
-        self.state = nn.Sequential(
-            nn.Conv2d(o.deep, 128, 3, padding=1), nn.ReLU(),
-            nn.Conv2d(128, o.hidden + o.context, 1),
-        )  # fmt: skip
+                nn.ReLU(), *two_convolutions(o.stem, o.stem, CHANNELS, 3, 1)
+            )
+        self.state = two_convolutions(o.deep, 128, o.hidden + o.context, 3, 1)
         self.hidden = o.hidden
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> FlowFeatures:
         height, width = images.shape[-2:]
         gh, gw = -(-(height - 7) // STRIDE), -(-(width - 7) // STRIDE)
-        images = _replicated(images, (0, -width % STRIDE, 0, -height % STRIDE))
+        beyond = (0, -width % STRIDE, 0, -height % STRIDE)
+        images = functional.pad(images, beyond, mode="replicate")
         half = self.at_half(self.stem(4 * images - 2))
         quarter = self.at_quarter(half)
         eighth = self.at_eighth(quarter)
@@ -232,7 +221,8 @@ class FlowResidual(nn.Module):
         stride = 1 if shift is None else 2
         self.first = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1 if stride == 1 else 0)
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
-        self.norm_first, self.norm_second = _norm(outputs), _norm(outputs)
+        self.norm_first = _norm(outputs)
+        self.norm_second = _norm(outputs)
         self.shortcut = nn.Conv2d(inputs, outputs, 1) if stride == 2 else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -250,21 +240,14 @@ class FlowUpdate(nn.Module):
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
         o = options
-        self.windows = nn.Sequential(
-            nn.Conv2d(len(o.levels) * WINDOW, 128, 1), nn.ReLU(),
-            nn.Conv2d(128, o.motion, 3, padding=1), nn.ReLU(),
-        )  # fmt: skip
-        self.flow = nn.Sequential(
-            nn.Conv2d(6, 48, 5, padding=2), nn.ReLU(), nn.Conv2d(48, 32, 3, padding=1), nn.ReLU()
-        )
+        self.windows = two_convolutions(len(o.levels) * WINDOW, 128, o.motion, 1, 3, nn.ReLU())
+        self.flow = two_convolutions(6, 48, 32, 5, 3, nn.ReLU())
         inputs = o.hidden + o.context + o.motion + 32
         self.gates = nn.Conv2d(inputs, 2 * o.hidden, 3, padding=1)
         self.candidate = nn.Conv2d(inputs, o.hidden, 3, padding=1)
         self.view = nn.Conv2d(o.hidden, o.hidden, 1)
         self.view_to_gates = nn.Linear(o.hidden, 3 * o.hidden)
-        self.head = nn.Sequential(
-            nn.Conv2d(o.hidden, 112, 3, padding=1), nn.ReLU(), nn.Conv2d(112, 7, 1)
-        )
+        self.head = two_convolutions(o.hidden, 112, 7, 3, 1)
 
     def forward(
         self, state: Tensor, context: Tensor, windows: Tensor, flow: Tensor
@@ -282,16 +265,8 @@ class FlowUpdate(nn.Module):
         return state, self.head(state)
 
 
-def cell_pixels(height: int, width: int, like: Tensor) -> Float[Tensor, "p 2"]:
-    """Return the pixels of the sample grid's cells, row by row."""
-    x = OFFSET + STRIDE * torch.arange(width, dtype=like.dtype, device=like.device)
-    y = OFFSET + STRIDE * torch.arange(height, dtype=like.dtype, device=like.device)
-    yy, xx = torch.meshgrid(y, x, indexing="ij")
-    return torch.stack([xx, yy], -1).reshape(-1, 2)
-
-
 def _mixture(values: Float[Tensor, "e p k"]) -> LaplaceMixture:
-    scale = values[..., 2:4].clamp(MIN_LOG_SCALE, MAX_LOG_SCALE)
+    scale = values[..., 2:4].clamp(-4.5, 3.0)
     outlier = scale + 1.0 + functional.softplus(values[..., 4:6])
     return LaplaceMixture(values[..., 6:7] + 2.0, scale, outlier.clamp(max=5.0))
 
@@ -315,22 +290,6 @@ def _pyramid(fields: dict[int, Tensor]) -> DescriptorPyramid:
 def _image(values: Float[Tensor, "e p k"], height: int) -> Float[Tensor, "e k h w"]:
     """Reshape values of cells to an image; the channels stay innermost in memory."""
     return values.unflatten(1, (height, -1)).permute(0, 3, 1, 2)
-
-
-def _replicated(x: Tensor, pad: tuple[int, ...]) -> Tensor:
-    """Pad by replication, also integers and channels-last fields."""
-    for axis, (before, after) in enumerate(zip(pad[::2], pad[1::2], strict=True)):
-        dim = x.dim() - 1 - axis
-        parts = [x.narrow(dim, 0, 1).expand(*_times(x, dim, before))] if before else []
-        parts.append(x)
-        if after:
-            parts.append(x.narrow(dim, x.shape[dim] - 1, 1).expand(*_times(x, dim, after)))
-        x = torch.cat(parts, dim) if len(parts) > 1 else x
-    return x
-
-
-def _times(x: Tensor, dim: int, count: int) -> list[int]:
-    return [count if d == dim else -1 for d in range(x.dim())]
 
 
 def _norm(channels: int) -> nn.Module:

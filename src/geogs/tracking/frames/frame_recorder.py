@@ -35,7 +35,8 @@ class FrameRecorder:
 
     def __init__(self, frames: FrameLog, keyframes: KeyframeSet, operator: FlowOperator) -> None:
         self._log = frames
-        self._keyframes, self._operator = keyframes, operator
+        self._keyframes = keyframes
+        self._operator = operator
         self._waiting = _in_order([r for r in frames.records if r.image is not None])
         self._rotations: deque[tuple[FrameRecord, Future[RelativeRotation | None]]] = deque()
         self._threads = ThreadPoolExecutor(ROTATION_THREADS, thread_name_prefix="rotations")
@@ -75,9 +76,15 @@ class FrameRecorder:
     ) -> None:
         """Add a frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
         record = FrameRecord(
-            frame.index, frame.timestamp, anchor, T_rel, self._keyframes[anchor].scale,
-            rotations=[*rotations], image=frame.image, encoded=encoded,
-        )  # fmt: skip
+            frame.index,
+            frame.timestamp,
+            anchor,
+            T_rel,
+            self._keyframes[anchor].scale,
+            rotations=[*rotations],
+            image=frame.image,
+            encoded=encoded,
+        )
         if match is not None:
             self._observe([(record, anchor)], match)
         self._log.records.append(record)
@@ -89,9 +96,13 @@ class FrameRecorder:
         """Add a frame that is a keyframe."""
         eye = torch.eye(4, dtype=torch.float64)
         record = FrameRecord(
-            keyframe.frame_index, keyframe.timestamp, keyframe.id, eye, keyframe.scale,
+            keyframe.frame_index,
+            keyframe.timestamp,
+            keyframe.id,
+            eye,
+            keyframe.scale,
             rotations=[*rotations],
-        )  # fmt: skip
+        )
         self._log.records.append(record)
 
     def measure_rotation(self, measure: Callable[[], RelativeRotation | None]) -> None:
@@ -118,7 +129,8 @@ class FrameRecorder:
                 break
             if record.anchor == removed.id:
                 T_rel = removed.at_present_scale(record.T_rel, record.scale) @ base
-                record.anchor, record.T_rel = substitute, T_rel
+                record.anchor = substitute
+                record.T_rel = T_rel
                 record.scale = self._keyframes[substitute].scale
                 record.observations = [o for o in record.observations if o.keyframe != removed.id]
                 if record.index == removed.frame_index:
@@ -132,9 +144,7 @@ class FrameRecorder:
 
     def keyframe_restored(self, record: FrameRecord, keyframe: Keyframe) -> None:
         """Make a frame whose keyframe was dropped a keyframe again."""
-        eye = torch.eye(4, dtype=torch.float64)
-        record.anchor, record.T_rel, record.scale = keyframe.id, eye, keyframe.scale
-        record.observations = []
+        _anchor(record, keyframe, torch.eye(4, dtype=torch.float64))
         self._stop_waiting([record])
 
     def unplaced(self) -> list[FrameRecord]:
@@ -146,8 +156,7 @@ class FrameRecorder:
         self, record: FrameRecord, anchor: int, T_rel: Float[Tensor, "4 4"], match: FlowMatch
     ) -> None:
         """Set the pose of a frame, with the flow that located it."""
-        record.anchor, record.T_rel, record.scale = anchor, T_rel, self._keyframes[anchor].scale
-        record.observations = []
+        _anchor(record, self._keyframes[anchor], T_rel)
         self._observe([(record, anchor)], match)
 
     def place_found(self, found: FoundFrames, others: Sequence["FrameRecorder"]) -> None:
@@ -163,10 +172,9 @@ class FrameRecorder:
             theirs[:] = [r for r in theirs if r.index not in poses]
         self._log.records[:] = _in_order(self._log.records)
         for record in (r for r in self.log.records if r.index in poses):
-            anchor = min(self._keyframes, key=lambda k: abs(k.frame_index - record.index))
-            record.anchor, record.scale = anchor.id, anchor.scale
-            record.T_rel = poses[record.index] @ se3_inverse(anchor.T_cw)
-            record.observations, record.is_found = [], True
+            nearest = min(self._keyframes, key=lambda k: abs(k.frame_index - record.index))
+            _anchor(record, nearest, poses[record.index] @ se3_inverse(nearest.T_cw))
+            record.is_found = True
 
     def absorb(self, other: "FrameRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's table."""
@@ -199,7 +207,8 @@ class FrameRecorder:
 
     def _let_wait(self, record: FrameRecord, keyframe: Keyframe) -> None:
         """Keep the image of a frame that is no longer a keyframe."""
-        record.image, record.encoded = keyframe.image, keyframe.encoded
+        record.image = keyframe.image
+        record.encoded = keyframe.encoded
         self._waiting = _in_order([*self._waiting, record])
 
     def _stop_waiting(self, records: Sequence[FrameRecord]) -> None:
@@ -229,12 +238,21 @@ class FrameRecorder:
 
     def _observe(self, jobs: list[tuple[FrameRecord, int]], match: FlowMatch) -> None:
         """Store the matches of records with keyframes."""
-        pixels, weight = match.pixels[:, self._cells], match.weight[:, self._cells]
+        pixels = match.pixels[:, self._cells]
+        weight = match.weight[:, self._cells]
         position, half_weight = pack_matches(self._keyframes.grid, pixels, weight)
         for n, (record, keyframe) in enumerate(jobs):
             # The test would wait for the GPU; an observation without weight does no harm.
             if self._keyframes.grid.on_gpu or bool((weight[n] > 0).any()):
                 record.observations.append(Observation(keyframe, position[n], half_weight[n]))
+
+
+def _anchor(record: FrameRecord, keyframe: Keyframe, T_rel: Float[Tensor, "4 4"]) -> None:
+    """Set the pose of a frame relative to a keyframe, without matches."""
+    record.anchor = keyframe.id
+    record.T_rel = T_rel
+    record.scale = keyframe.scale
+    record.observations = []
 
 
 def pose_of(record: FrameRecord, keyframes: KeyframeSet) -> Float[Tensor, "4 4"]:

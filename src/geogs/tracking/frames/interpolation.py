@@ -33,7 +33,8 @@ def bridged(
         for n, R in enumerate(R_cw):
             if R is not None:
                 T = torch.eye(4, dtype=torch.float64)
-                T[:3, :3], T[:3, 3] = R, -R @ centres[n]
+                T[:3, :3] = R
+                T[:3, 3] = -R @ centres[n]
                 poses[n] = T
     tracked, oriented = (np.array([x is not None for x in some], bool) for some in (T_cw, R_cw))
     return Trajectory(timestamps, interpolate(timestamps, poses), tracked, oriented)

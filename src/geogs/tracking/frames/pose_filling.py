@@ -47,9 +47,7 @@ def solve_trajectory(
     )
     timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
     return bridged(
-        timestamps,
-        [solved.get(r.index) for r in records],
-        [oriented.get(r.index) for r in records],
+        timestamps, [solved.get(r.index) for r in records], [oriented.get(r.index) for r in records]
     )
 
 
@@ -102,11 +100,13 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
     for part, ids in seen_by_keyframes(frames, keyframes):
         seen = [record.index for record, _ in part]
         shifts = errors.of_matches(
-            [keyframes[k].frame_index for k in ids], seen,
+            [keyframes[k].frame_index for k in ids],
+            seen,
             errors.poses(seen) @ se3_inverse(keyframes.poses(ids)),
-            grid.rays[cells], keyframes.inverse_depths(ids)[:, cells],
+            grid.rays[cells],
+            keyframes.inverse_depths(ids)[:, cells],
             unpacked_positions(grid, torch.stack([o.of_one_lens for _, o in part])),
-        )  # fmt: skip
+        )
         steps = in_steps(grid.camera, shifts.shift)
         for (_, observation), step in zip(part, steps, strict=True):
             observation.shift = step
@@ -132,35 +132,34 @@ def observed(
 ) -> Iterator[tuple[list[FrameRecord], MotionProblem]]:
     """Yield the frames between keyframes that have matches, in parts, at their last poses.
 
-    Matches are those of :func:`~geogs.tracking.frames.frame_recorder.sparse_cells`.
+    Matches are those of :func:`~geogs.tracking.frames.frame_recorder.sparse_cells`; their weights
+    include the depth variance of the cells.
     """
-    are_keyframes = {s.frame_index for s in keyframes}
-    seen = [
-        r for r in tracked
-        if r.index not in are_keyframes and any(o.keyframe in keyframes for o in r.observations)
-    ]  # fmt: skip
-    for part in in_parts(seen, keyframes.grid.on_gpu):
-        yield part, _problem(part, keyframes)
-
-
-def _problem(records: Sequence[FrameRecord], keyframes: KeyframeSet) -> MotionProblem:
-    """Return frames and all their observations, with the depth variance of cells in the weights."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
-    pairs = [
-        (n, o) for n, r in enumerate(records) for o in r.observations if o.keyframe in keyframes
+    are_keyframes = {s.frame_index for s in keyframes}
+    seen = [
+        r
+        for r in tracked
+        if r.index not in are_keyframes and any(o.keyframe in keyframes for o in r.observations)
     ]
-    start = torch.stack([pose_of(r, keyframes) for r in records])
-    ids = [o.keyframe for _, o in pairs]
-    frame = torch.tensor([n for n, _ in pairs])
-    depth = keyframes.inverse_depths(ids)[:, cells]
-    information = keyframes.informations(ids)[:, cells]
-    source = keyframes.poses(ids)
-    weight = torch.stack([o.half_weight for _, o in pairs]).float()
-    p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
-    weight = depth_aware_weight(weight, p.depth_jacobian, information)
-    pixels = unpacked_positions(grid, torch.stack([o.shifted for _, o in pairs]))
-    return MotionProblem(start, depth, source, frame, pixels, weight)
+    for part in in_parts(seen, grid.on_gpu):
+        pairs = [
+            (n, o) for n, r in enumerate(part) for o in r.observations if o.keyframe in keyframes
+        ]
+        start = torch.stack([pose_of(r, keyframes) for r in part])
+        ids = [o.keyframe for _, o in pairs]
+        frame = torch.tensor([n for n, _ in pairs])
+        depth = keyframes.inverse_depths(ids)[:, cells]
+        source = keyframes.poses(ids)
+        p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
+        weight = depth_aware_weight(
+            torch.stack([o.half_weight for _, o in pairs]).float(),
+            p.depth_jacobian,
+            keyframes.informations(ids)[:, cells],
+        )
+        pixels = unpacked_positions(grid, torch.stack([o.shifted for _, o in pairs]))
+        yield part, MotionProblem(start, depth, source, frame, pixels, weight)
 
 
 def depth_aware_weight(

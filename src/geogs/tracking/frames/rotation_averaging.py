@@ -2,28 +2,21 @@
 
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import so3_exp, so3_log
 from geogs.world.frames import RelativeRotation
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_matrix
 
 ROUNDS = 3
 """Gauss-Newton steps of the averaging."""
 
 
 def orientations(
-    relative: Mapping[int, Sequence[RelativeRotation]],
-    known: Mapping[int, Float64[Tensor, "3 3"]],
+    relative: Mapping[int, Sequence[RelativeRotation]], known: Mapping[int, Float64[Tensor, "3 3"]]
 ) -> dict[int, Float64[Tensor, "3 3"]]:
     """Estimate world to camera of all frames linked to the known ones by relative rotations.
 
@@ -45,9 +38,9 @@ def orientations(
     free = sorted(found.keys() - fixed.keys())
     moved = set(free)
     used = [link for link in links if link[0] in found and not moved.isdisjoint(link[:2])]
-    if free:
-        problem = partial(_linearised, free, used), partial(_stepped, free)
-        found = minimise(found, *problem, Policy(ROUNDS)).state
+    for _ in range(ROUNDS if free else 0):
+        steps = _steps(free, used, found)
+        found |= {n: step @ found[n] for n, step in zip(free, steps, strict=True)}
     return {n: R for n, R in found.items() if n not in known}
 
 
@@ -66,7 +59,8 @@ def _followed(
     neighbours: Mapping[int, list[tuple[int, Tensor]]], start: Mapping[int, Tensor]
 ) -> dict[int, Tensor]:
     """Return the rotations of the start and of all frames linked to it, by the fewest links."""
-    found, queue = dict(start), deque(start)
+    found = dict(start)
+    queue = deque(start)
     while queue:
         a = queue.popleft()
         for b, R in neighbours.get(a, ()):
@@ -76,15 +70,16 @@ def _followed(
     return found
 
 
-def _linearised(
+def _steps(
     free: list[int], links: list[tuple[int, int, Tensor, float]], found: dict[int, Tensor]
-) -> tuple["csc_matrix", Float64[np.ndarray, "n"]]:
-    """Return the Jacobian of the links by left steps of the free rotations, and the errors.
+) -> Float64[Tensor, "n 3 3"]:
+    """Return a Gauss-Newton step of each free rotation, from the left.
 
     With ``R_b R_a^T`` for the rotation R of b relative to a, the error is
     ``log(R (R_b R_a^T)^T)``; to first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
     """
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_matrix  # slow to import
+    from scipy.sparse.linalg import spsolve
 
     column = {n: 3 * k for k, n in enumerate(free)}
     first = torch.stack([found[a] for a, _, _, _ in links])
@@ -103,18 +98,5 @@ def _linearised(
     at = rows.ravel(), columns.ravel()
     shape = (3 * len(links), 3 * len(free))
     J = coo_matrix((values[link, end].ravel(), at), shape).tocsc()
-    return J, error.numpy().ravel()
-
-
-def _stepped(
-    free: list[int],
-    found: dict[int, Tensor],
-    linear: tuple["csc_matrix", Float64[np.ndarray, "n"]],
-    damping: float,
-) -> Step[dict[int, Tensor]]:
-    from scipy.sparse.linalg import spsolve
-
-    J, error = linear
-    step = spsolve((J.T @ J).tocsc(), J.T @ error)
-    moves = so3_exp(torch.from_numpy(step).reshape(-1, 3))
-    return Step(found | {n: move @ found[n] for n, move in zip(free, moves, strict=True)})
+    step = spsolve((J.T @ J).tocsc(), J.T @ error.numpy().ravel())
+    return so3_exp(torch.from_numpy(step).reshape(-1, 3))

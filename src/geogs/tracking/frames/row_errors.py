@@ -13,12 +13,13 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.bundle.projection import MIN_Z, carried_over, project, seen_from_targets
 from geogs.camera.shutter.rows import CELL
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
+from geogs.tracking.frames.seen_rows import node_values, rows_at
 from geogs.types import FrameLens, SeenRows, Trajectory
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
@@ -129,8 +130,8 @@ class RowErrors:
         """
         if not lenses:
             return self
-        other, none = copy.copy(self), FrameLens()
-        turns = {frame: _turn_of(lenses.get(frame, none)) for frame in self._T_cw}
+        other = copy.copy(self)
+        turns = {frame: _turn_of(lenses.get(frame, FrameLens())) for frame in self._T_cw}
         other._rectified = {
             frame: replace(
                 f,
@@ -178,7 +179,7 @@ class RowErrors:
         if known:
             at = torch.tensor(known, device=pixels.device)
             which = torch.arange(len(known), device=pixels.device)
-            _, when = seen_rows([f.rows for f in own], which, pixels[at])
+            _, when = rows_at([f.rows for f in own], which, pixels[at])
             found[at] = self._factor * when
         return found
 
@@ -245,35 +246,27 @@ class RowErrors:
             order = {frame: n for n, frame in enumerate(rectified)}
             at = torch.tensor(known, device=pixels.device)
             found.shift[at], found.slope[at] = self._shifted(
-                list(rectified.values()), [order[frames[n]] for n in known],
-                pixels[at], inverse_depth[at],
-            )  # fmt: skip
+                list(rectified.values()),
+                [order[frames[n]] for n in known],
+                pixels[at],
+                inverse_depth[at],
+            )
         elif rectified:
-            self._shift_each(frames, rectified, pixels, inverse_depth, found)
+            from geogs.tracking.frames.row_kernels import shift_pixels
+
+            camera = np.array(self._grid.camera.numbers, np.float32)
+            limits = np.array([CELL, MIN_Z], np.float32)
+            factor = np.float32(self._factor)
+            own = {
+                frame: (node_values(f.rows).float().numpy(), f.times.numpy(), f.motions.numpy())
+                for frame, f in rectified.items()
+            }
+            inputs = pixels, self._grid.camera.plane(pixels), inverse_depth
+            each = zip(*(x.contiguous().numpy() for x in (*inputs, *found)), strict=True)
+            for frame, edge in zip(frames, each, strict=True):
+                if frame in own:
+                    shift_pixels(*own[frame], camera, limits, factor, *edge)
         return found
-
-    def _shift_each(
-        self,
-        frames: Sequence[int],
-        rectified: Mapping[int, _RectifiedFrame],
-        pixels: Float[Tensor, "e p 2"],
-        inverse_depth: Float[Tensor, "e p"],
-        found: RowShifts,
-    ) -> None:
-        """Do :meth:`_shifted` for all edges of rectified frames, compiled, into ``found``."""
-        from geogs.tracking.frames.row_kernels import shift_pixels
-
-        camera = np.array(self._grid.camera.numbers, np.float32)
-        limits, factor = np.array([CELL, MIN_Z], np.float32), np.float32(self._factor)
-        known = {
-            frame: (laid(f.rows).float().numpy(), f.times.numpy(), f.motions.numpy())
-            for frame, f in rectified.items()
-        }
-        both = pixels, self._grid.camera.plane(pixels), inverse_depth
-        each = zip(*(x.contiguous().numpy() for x in (*both, *found)), strict=True)
-        for frame, edge in zip(frames, each, strict=True):
-            if frame in known:
-                shift_pixels(*known[frame], camera, limits, factor, *edge)
 
     def _shifted(
         self,
@@ -283,17 +276,18 @@ class RowErrors:
         inverse_depth: Float[Tensor, "e p"],
     ) -> RowShifts:
         """Do :meth:`of_pixels` for edges, each in ``which`` of the frames, in plain PyTorch."""
-        camera, at = self._grid.camera, torch.tensor(which, device=pixels.device)
-        offset, seconds = seen_rows([f.rows for f in rectified], at, pixels)
+        camera = self._grid.camera
+        at = torch.tensor(which, device=pixels.device)
+        offset, seconds = rows_at([f.rows for f in rectified], at, pixels)
         T = torch.stack([f.motions for f in rectified]).to(pixels)[at]
         times = torch.stack([f.times for f in rectified]).to(pixels)[at]
         weights, changes = lagrange(times, self._factor * seconds)
-        focal, centre = (
-            pixels.new_tensor([camera.fx, camera.fy]), pixels.new_tensor([camera.cx, camera.cy])
-        )  # fmt: skip
+        focal = pixels.new_tensor([camera.fx, camera.fy])
+        centre = pixels.new_tensor([camera.cx, camera.cy])
         plane = camera.plane(pixels)
         rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
-        moved, change = torch.zeros_like(plane), torch.zeros_like(plane)
+        moved = torch.zeros_like(plane)
+        change = torch.zeros_like(plane)
         for j in range(NODES):
             y, _, z = seen_from_targets(rays, T[:, j], inverse_depth)
             there = y[..., :2] / z[..., None]
@@ -322,10 +316,13 @@ def row_shifts(
     frame_of = frame_of or (lambda id: keyframes[id].frame_index)
     pixels, _ = edge_matches(keyframes.grid, [measured[pair] for pair in part])
     return errors.of_matches(
-        [frame_of(i) for i, _ in part], [frame_of(j) for _, j in part],
-        keyframes.relative_poses(part), keyframes.grid.rays,
-        keyframes.inverse_depths([i for i, _ in part]), pixels,
-    )  # fmt: skip
+        [frame_of(i) for i, _ in part],
+        [frame_of(j) for _, j in part],
+        keyframes.relative_poses(part),
+        keyframes.grid.rays,
+        keyframes.inverse_depths([i for i, _ in part]),
+        pixels,
+    )
 
 
 def edge_shifts(
@@ -354,10 +351,13 @@ def lagrange(
     off = [at - time[:, None] for time in times.unbind(1)]
     spans = times[:, :, None] - times[:, None]
     scale = (1 / (spans + torch.eye(NODES).to(spans)).prod(-1)).unbind(1)
-    weights, changes = [], []
+    weights = []
+    changes = []
     for j in range(NODES):
         a, b, c, d = (off[other] for other in range(NODES) if other != j)
-        ab, cd, by = a * b, c * d, scale[j][:, None]
+        ab = a * b
+        cd = c * d
+        by = scale[j][:, None]
         weights.append(ab * cd * by)
         changes.append((ab * (c + d) + cd * (a + b)) * by)
     return weights, changes
@@ -398,22 +398,3 @@ def _nodes(trajectory: Trajectory, longest_interval: float) -> list[np.ndarray |
             start = int(np.clip(frame - NODES // 2, first, last + 1 - NODES))
             nodes[frame] = np.arange(start, start + NODES)
     return nodes
-
-
-def seen_rows(
-    rows: Sequence[SeenRows], which: Int[Tensor, "e"], pixels: Float[Tensor, "e p 2"]
-) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
-    """Return offsets and seconds at pixels, each in ``which`` of the rows, bilinear between the
-    nodes as in the rectification."""
-    field = torch.stack([laid(r) for r in rows]).to(pixels).permute(0, 3, 1, 2)[which]
-    size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
-    position = 2 * (pixels + CELL + 0.5) / size - 1
-    values = torch.nn.functional.grid_sample(
-        field, position[:, :, None], padding_mode="border", align_corners=False
-    )[..., 0]
-    return values[:, :2].mT, values[:, 2]
-
-
-def laid(rows: SeenRows) -> Float[Tensor, "r c 3"]:
-    """Concatenate offsets and seconds of the nodes."""
-    return torch.cat([rows.offset, rows.seconds[..., None]], -1)

@@ -11,9 +11,7 @@ _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _TWO, _FOUR = np.float32(2.0), np.float32(4.0)
 
 
-@njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
-)  # fmt: skip
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})
 def shift_pixels(
     field, times, motions, camera, limits, factor, pixels, plane, inverse_depth, shift, slope
 ):
@@ -24,13 +22,17 @@ def shift_pixels(
     and the least z. Then the factor on the readout, pixels (p, 2), their points on the plane z = 1
     (p, 2) and inverse depths (p); all float32.
     """
-    fx, fy, cx, cy, k1, k2 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
-    cell, nearest = limits[0], limits[1]
+    fx = camera[0]
+    fy = camera[1]
+    cx = camera[2]
+    cy = camera[3]
+    k1 = camera[4]
+    k2 = camera[5]
+    cell = limits[0]
+    nearest = limits[1]
     bottom, right = field.shape[0] - 1, field.shape[1] - 1
-    seconds, inverse_span = (
-        np.empty(len(pixels), np.float32),
-        np.empty((_NODES, _NODES), np.float32),
-    )
+    seconds = np.empty(len(pixels), np.float32)
+    inverse_span = np.empty((_NODES, _NODES), np.float32)
     for j in range(_NODES):
         for other in range(_NODES):
             inverse_span[j, other] = _ONE / (times[j] - times[other]) if j != other else _ONE
@@ -51,11 +53,13 @@ def shift_pixels(
             else:
                 seconds[n] = value
     for n in range(len(pixels)):
-        at, d = factor * seconds[n], inverse_depth[n]
+        at = factor * seconds[n]
+        d = inverse_depth[n]
         x, y = plane[n, 0], plane[n, 1]
         u = v = along = across = _ZERO
         for j in range(_NODES):
-            weight, change = _ONE, _ZERO
+            weight = _ONE
+            change = _ZERO
             for other in range(_NODES):
                 if other != j:
                     part = (at - times[other]) * inverse_span[j, other]

@@ -46,10 +46,8 @@ def static_weight(
     weight: Float[Tensor, "e p 2"],
 ) -> Float[Tensor, "e p 2"]:
     """Return the weights of matches, zero for those from or to a dynamic cell."""
-    some = [
-        n for n, (i, j) in enumerate(directed)
-        if keyframes[i].moving is not None or keyframes[j].moving is not None
-    ]  # fmt: skip
+    dynamic = {k for k in {k for e in directed for k in e} if keyframes[k].moving is not None}
+    some = [n for n, e in enumerate(directed) if not dynamic.isdisjoint(e)]
     if not some:
         return weight
     weight = weight.clone()
@@ -77,10 +75,7 @@ def dynamic_fraction(keyframes: KeyframeSet) -> float:
 
 
 def update_dynamic(
-    keyframes: KeyframeSet,
-    edges: Mapping[Pair, Edge],
-    decided: Sequence[Pair],
-    threshold: float,
+    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], decided: Sequence[Pair], threshold: float
 ) -> None:
     """Update the dynamic cells of the sources of some directed edges.
 
@@ -101,9 +96,7 @@ def update_dynamic(
         total = ratio.new_zeros(len(ids), ratio.shape[1])
         count = total.index_add(0, row, (~ratio.isnan()).to(ratio))
         total = total.index_add(0, row, ratio.nan_to_num(0.0))
-        none = torch.zeros_like(static[0])
-        moving = [keyframes[k].moving for k in ids.tolist()]
-        before = torch.stack([none if cells is None else cells for cells in moving])
+        before = keyframes.moving(ids.tolist())
         # The median over the static cells of an edge is its usual parallax.
         usual = torch.where(static, parallax, torch.nan).nanmedian(1).values[:, None]
         moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
@@ -128,7 +121,8 @@ def dynamic_cells(
     it, so that a moving region includes its border. All keep their state ``before`` if none can be
     decided, or nearly all exceed it: then the pose or the image is wrong.
     """
-    near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
+    near = _mean(grid, total, 3)
+    seen = _mean(grid, count, 3)
     known = seen >= MIN_MATCHES
     core = (near > threshold * seen) & known
     is_known = known.any(1, keepdim=True) & (core.sum(1) <= MAX_DYNAMIC * known.sum(1))[:, None]
@@ -147,17 +141,9 @@ def _static(
     keyframes: KeyframeSet, directed: Sequence[Pair], pixels: Float[Tensor, "e p 2"]
 ) -> Bool[Tensor, "e p"]:
     """Whether matches neither start nor end in a dynamic cell."""
-    grid = keyframes.grid
-    none = torch.zeros(grid.size, dtype=torch.bool, device=grid.device)
-
-    def moving(k: int) -> Bool[Tensor, "p"]:
-        found = keyframes[k].moving
-        return none if found is None else found
-
-    cell, inside = grid.cells_of(pixels)
-    source = torch.stack([moving(i) for i, _ in directed])
-    target = torch.stack([moving(j) for _, j in directed]).gather(1, cell)
-    return ~(source | (target & inside))
+    cell, inside = keyframes.grid.cells_of(pixels)
+    source, target = (keyframes.moving([e[k] for e in directed]) for k in (0, 1))
+    return ~(source | (target.gather(1, cell) & inside))
 
 
 def relative_residuals(

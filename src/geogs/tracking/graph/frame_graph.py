@@ -1,13 +1,13 @@
 """The frame graph: pairs of covisible keyframes, and the flow measured between them."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.device_choice import (
     bundle_solver,
     grid_fields,
@@ -17,15 +17,16 @@ from geogs.bundle.device_choice import (
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions, BundleResult
+from geogs.bundle.terms import DepthDamping, MeasuredDepths
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.dynamic_cells import static_weight, update_dynamic
-from geogs.tracking.graph.influence import solve_bounded
 from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.graph.proximity import PAIRS_TOGETHER
 from geogs.types import FlowMatch
+from geogs.world.cell_depths import MeasuredCells
 from geogs.world.edges import Edge, MeasuredEdge, PackedEdge, Pair, edge_matches, pack_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
@@ -34,6 +35,11 @@ HUBER = 0.5
 """Huber threshold in standard deviations of the flow, which are overestimated."""
 STACKED_EDGES = 1024, 8192
 """Most directed edges of an adjustment with all matches in one tensor, on CPU and GPU."""
+FARTHER, NEAREST = 0.75, 2.5
+"""Quantile of a keyframe's inverse depth, and the multiple of it above which influence grows no
+more: three medians in a room, four and a half on a street."""
+LEAST = 0.01
+"""Least factor on a weight: before a far background only near cells determine the translation."""
 
 
 class FrameGraph:
@@ -107,7 +113,8 @@ class FrameGraph:
             return
         first, second = ([self.keyframes[p[k]].encoded for p in pairs] for k in (0, 1))
         both = self.reprojections(pairs + [(j, i) for i, j in pairs])
-        forward, backward = both[: len(pairs)], both[len(pairs) :]
+        forward = both[: len(pairs)]
+        backward = both[len(pairs) :]
         memory = [(self._memory((i, j)), self._memory((j, i))) for i, j in pairs]
         there, back = self.operator.measure(
             first, second, forward, backward, fine=fine, memory=memory
@@ -124,12 +131,17 @@ class FrameGraph:
         """Store a measurement that started from the present state."""
         position, half_weight = pack_matches(self.keyframes.grid, match.pixels, match.weight)
         for n, (i, j) in enumerate(directed):
-            source, target = self.keyframes[i], self.keyframes[j]
+            source = self.keyframes[i]
+            target = self.keyframes[j]
             self.edges[i, j] = PackedEdge(
-                position[n], half_weight[n], source.T_cw, target.T_cw, source.inverse_depth,
+                position[n],
+                half_weight[n],
+                source.T_cw,
+                target.T_cw,
+                source.inverse_depth,
                 None if match.damping is None else match.damping[n],
                 None if match.memory is None else match.memory[n],
-            )  # fmt: skip
+            )
 
     def _memory(self, directed: Pair) -> Any:
         edge = self.edges.get(directed)
@@ -180,7 +192,8 @@ class FrameGraph:
     ) -> tuple[StreamedProblem, list[int]]:
         """Return the same as :meth:`problem`, with matches read in parts."""
         directed = sorted(directed)
-        poses, depths = set(free_pose), set(free_depth)
+        poses = set(free_pose)
+        depths = set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
         slot = {k: n for n, k in enumerate(ids)}
         edges = [self.edges[e] for e in directed]
@@ -237,7 +250,8 @@ class FrameGraph:
             result = self._solve(problem, options)
         if not result.finite:
             return None
-        depths, poses = set(free_depth), set(free_pose)
+        depths = set(free_depth)
+        poses = set(free_pose)
         for n, k in enumerate(ids):
             if k in poses:
                 self.keyframes[k].T_cw = result.T_cw[n]
@@ -264,15 +278,10 @@ def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
     """Return sensor depths of keyframes' cells; None where no keyframe has any."""
     if all(k.measured is None for k in keyframes):
         return None
-    unknown = torch.zeros_like(keyframes[0].inverse_depth)
-    both = [
-        (unknown, unknown)
-        if k.measured is None
-        else (k.measured.inverse_depth, k.measured.information)
-        for k in keyframes
-    ]
-    inverse_depth, information = (torch.stack(m) for m in zip(*both, strict=True))
-    return MeasuredDepths(inverse_depth, information)
+    zero = torch.zeros_like(keyframes[0].inverse_depth)
+    cells = [k.measured or MeasuredCells(zero, zero) for k in keyframes]
+    inverse_depth = torch.stack([c.inverse_depth for c in cells])
+    return MeasuredDepths(inverse_depth, torch.stack([c.information for c in cells]))
 
 
 def _edge_of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> MeasuredEdge:
@@ -287,10 +296,12 @@ def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e 
     packed = [e for e in edges if isinstance(e, PackedEdge)]
     if packed and len(packed) == len(edges):
         return _packed_reprojections(grid, packed)
-    return torch.stack([
-        e.reprojection if isinstance(e, MeasuredEdge) else _packed_reprojections(grid, [e])[0]
-        for e in edges
-    ])  # fmt: skip
+    return torch.stack(
+        [
+            e.reprojection if isinstance(e, MeasuredEdge) else _packed_reprojections(grid, [e])[0]
+            for e in edges
+        ]
+    )
 
 
 def _packed_reprojections(grid: SampleGrid, edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
@@ -316,3 +327,46 @@ def _frame_damping(
         mean = mean / count.clamp(min=1)
         total = total + mean.mT.to(damping) @ damping
     return DepthDamping(total)
+
+
+def bounded_influence(inverse_depth: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+    """Return factors on the weights of matches, by the inverse depths of their cells.
+
+    One up to ``NEAREST`` times the usual inverse depth; beyond, the influence on a translation is
+    constant (a Mallows estimator: the bound depends on where a measurement was taken, not on how
+    it fits). ``LEAST`` at least.
+    """
+    rank = 1 + int(FARTHER * (inverse_depth.shape[1] - 1))
+    usual = inverse_depth.kthvalue(rank, 1, keepdim=True).values
+    return (NEAREST * usual / inverse_depth.clamp(min=1e-9)).clamp(max=1).square().clamp(min=LEAST)
+
+
+def solve_bounded(
+    problem: StreamedProblem,
+    solve: Callable[[StreamedProblem, BundleOptions], BundleResult],
+    options: BundleOptions,
+) -> BundleResult:
+    """Solve with bounded influence of near cells, then for the depths alone without a bound: only
+    the influence on poses has to be limited, not that on a cell's own depth.
+
+    The effect of a match on the translation is proportional to the cell's inverse depth, and its
+    weight in the normal equations to the square. An object that moves across a nearly static view
+    looks very near, gets a large influence, and can pull the camera's motion until it fits; then it
+    can no longer be detected. Once dynamic cells are detected, near cells may count in full.
+    """
+    influence = bounded_influence(problem.inverse_depth)
+    if bool((influence == 1).all()):
+        return solve(problem, options)
+
+    def matches(part: slice) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+        pixels, weight = problem.matches(part)
+        source = problem.source[part].to(influence.device)
+        return pixels, weight * influence[source][..., None]
+
+    found = solve(replace(problem, matches=matches), options)
+    none = torch.zeros_like(problem.free_pose)
+    held = replace(
+        problem, T_cw=found.T_cw, inverse_depth=found.inverse_depth, free_pose=none, pose_terms=()
+    )
+    of_depths = solve(held, replace(options, iterations=1))
+    return replace(of_depths, finite=found.finite and of_depths.finite)

@@ -11,7 +11,7 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float
 
-from geogs.bundle.motion_term import MeasuredMotions
+from geogs.bundle.terms import MeasuredMotions
 from geogs.config import OdometryConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.priors.odometry import ScaleVote, information_of, vote_on_scale
@@ -91,7 +91,8 @@ class Odometry:
 
     def since(self, keyframe: Keyframe, pose: MeasuredPose | None) -> torch.Tensor | None:
         """Return the odometry motion from a keyframe to a pose, in the unit of the map."""
-        before, scale = keyframe.pose, self.found.scale
+        before = keyframe.pose
+        scale = self.found.scale
         if scale is None or pose is None or before is None or before.world != pose.world:
             return None
         motion = pose.T_cw @ se3_inverse(before.T_cw)

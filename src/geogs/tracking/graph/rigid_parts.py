@@ -45,7 +45,8 @@ def largest_part(
     directed = sorted(edges)
     source = torch.tensor([i for i, _ in directed], dtype=torch.long)
     for chunk in source_chunks(source, EDGES_TOGETHER):
-        some, of = directed[chunk], source[chunk]
+        some = directed[chunk]
+        of = source[chunk]
         ratio, _, static = relative_residuals(keyframes, edges, some)
         agrees = ((ratio < MAX_RESIDUAL) & static).float()
         common = (agrees @ agrees.mT).cpu()

@@ -84,7 +84,8 @@ def calls_for_keyframe(
         patience: relative increase of the thresholds.
         part: fraction of the usual parallax that is enough.
     """
-    more, long_edge = 1 + patience, grid.camera.long_edge
+    more = 1 + patience
+    long_edge = grid.camera.long_edge
     if config.keyframe_mean_flow > 0:
         return mean_flow(grid, seen.match) >= config.keyframe_mean_flow * more * long_edge
     enough = config.keyframe_parallax * more * long_edge
@@ -116,8 +117,11 @@ def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
     size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
     grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     grey = grey.astype(np.float32)
-    x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
-    xx, yy, xy = float((x * x).mean()), float((y * y).mean()), float((x * y).mean())
+    x = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
+    y = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    xx = float((x * x).mean())
+    yy = float((y * y).mean())
+    xy = float((x * y).mean())
     least = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)  # eigenvalue of the mean outer product
     return least / float(grey.var() + 1.0)
 
@@ -152,15 +156,13 @@ class KeyframeChoice:
         """
         if self.config.keyframe_mean_flow > 0:
             return calls_for_keyframe(self.config, self.grid, seen)
-        patience, part = BLUR_WAIT if self._is_blurred() else 0.0, END_FRACTION if near else 1.0
+        self.settle()
+        recent = self._recent
+        is_blurred = len(recent) >= 3 and recent[-1] < BLUR_RATIO * float(np.median(recent))
+        patience = BLUR_WAIT if is_blurred else 0.0
+        part = END_FRACTION if near else 1.0
         return calls_for_keyframe(self.config, self.grid, seen, patience, part)
 
     def _note(self, value: float) -> None:
         self._recent.append(value)
         del self._recent[:-_COMPARED]
-
-    def _is_blurred(self) -> bool:
-        self.settle()
-        if len(self._recent) < 3:
-            return False
-        return self._recent[-1] < BLUR_RATIO * float(np.median(self._recent))

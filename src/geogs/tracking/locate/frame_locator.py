@@ -40,23 +40,16 @@ FEATURE_CANDIDATES = 2
 """Keyframes whose features are matched with a frame when the camera is lost."""
 
 
-@dataclass(frozen=True)
-class FrameMotion:
-    """A frame located against a keyframe."""
+@dataclass(frozen=True, kw_only=True)
+class FrameMotion(SeenMotion):
+    """A frame located against a keyframe; its overlap is the fraction of the keyframe's cells with
+    known depth whose match agrees with the pose."""
 
     keyframe: int
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
-    match: FlowMatch
-    """One edge, keyframe -> frame."""
-    flow: float
-    """Median motion of the matched cells in pixels."""
-    parallax: float
-    """Median of that motion without the camera's rotation, which determines depth."""
     matched: float
-    """Fraction of the keyframe's cells with a match that agrees with the pose."""
-    overlap: float
-    """The same fraction of its cells with known depth."""
+    """The same fraction of all cells."""
     known: float
     """Fraction of the keyframe's cells that are matched, with a depth known well enough to locate
     the camera."""
@@ -64,11 +57,6 @@ class FrameMotion:
     """Median distance in pixels between matches and reprojection."""
     check: PhotometricCheck
     """Agreement of the images at this pose."""
-
-    @property
-    def seen(self) -> SeenMotion:
-        """Criteria for a new keyframe."""
-        return SeenMotion(self.flow, self.overlap, self.match, self.parallax)
 
     def is_where(self, other: "FrameMotion") -> bool:
         """Whether the median difference from another pose's matches of the keyframe is small."""
@@ -179,10 +167,17 @@ class FrameLocator:
             return None
         if not check.passes(self.min_ncc, is_expected):
             return None
-        T_cw = found[:16].reshape(4, 4)
-        overlap = agree / informed
         return FrameMotion(
-            keyframe.id, T_cw, match, flow, parallax, agree, overlap, known, residual, check
+            flow,
+            agree / informed,
+            match,
+            parallax,
+            keyframe=keyframe.id,
+            T_cw=found[:16].reshape(4, 4),
+            matched=agree,
+            known=known,
+            residual=residual,
+            check=check,
         )
 
     def locate_relative(

@@ -14,7 +14,7 @@ from geogs.tracking.locate.orientation_follower import Followed
 from geogs.tracking.matching.flow_chain import MIN_MATCHED
 from geogs.tracking.matching.photometric_check import MIN_NCC
 from geogs.types import Frame
-from geogs.world.keyframes import Keyframe
+from geogs.world.keyframes import Keyframe, KeyframeSet
 
 MAX_RESIDUAL = 0.008
 """Median reprojection error above which the camera is lost, as a fraction of the long edge."""
@@ -47,7 +47,8 @@ class SegmentLocaliser:
         last = self.map.segment.status.last
         if last is None:
             return None
-        keyframe, locate = self.map.keyframes[last.keyframe], self.locator.locate
+        keyframe = self.map.keyframes[last.keyframe]
+        locate = self.locator.locate
         motion = locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
         if motion is None:
             given = self.map.odometry.since(keyframe, frame.pose)
@@ -59,19 +60,19 @@ class SegmentLocaliser:
 
     def relocalise(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
         """Locate the frame anywhere: first at the pose of a pure rotation."""
-        status, keyframes = self.map.segment.status, list(self.map.keyframes)
+        status = self.map.segment.status
         last = status.last
         if last is not None and followed is not None and followed.R is not None:
             rotation = torch.eye(4, dtype=torch.float64)
             rotation[:3, :3] = followed.R
             guess = rotation @ last.T_cw(self.map.keyframes[last.keyframe])
-            for keyframe in visible_keyframes(keyframes, guess):
+            for keyframe in visible_keyframes(self.map.keyframes, guess):
                 motion = self.locator.locate(keyframe, encoded, guess, is_expected=False)
                 if with_depth(motion) is not None:
                     return motion
             if followed.is_pure and status.misses % RELOCALISE_EVERY:
                 return None
-        return with_depth(self.locator.relocate_any(self._candidates(keyframes), encoded))
+        return with_depth(self.locator.relocate_any(self._candidates(), encoded))
 
     def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
         """Locate the frame at one of some recognised keyframes.
@@ -87,20 +88,24 @@ class SegmentLocaliser:
                 return motion
         return None
 
-    def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
+    def _candidates(self) -> list[Keyframe]:
         """Return keyframes to search for a lost camera: recent ones, and older ones in turn."""
-        recent, older = keyframes[: -MAX_TRIED - 1 : -1], keyframes[:-MAX_TRIED]
+        keyframes = list(self.map.keyframes)
+        recent = keyframes[: -MAX_TRIED - 1 : -1]
+        older = keyframes[:-MAX_TRIED]
         first = (self.map.segment.status.misses * MAX_TRIED) % max(len(older), 1)
         return recent + (older[first:] + older[:first])[:MAX_TRIED]
 
 
-def visible_keyframes(keyframes: Sequence[Keyframe], T_cw: Float[Tensor, "4 4"]) -> list[Keyframe]:
+def visible_keyframes(keyframes: KeyframeSet, T_cw: Float[Tensor, "4 4"]) -> list[Keyframe]:
     """Return the keyframes most of whose known depth falls into a camera's image, best first."""
-    if not keyframes:
+    if not len(keyframes):
         return []
-    axis = T_cw[2, :3]
-    facing = sorted(keyframes, key=lambda k: -float(k.T_cw[2, :3] @ axis))[:MAX_FACING]
-    grid = facing[0].grid
+    grid = keyframes.grid
+    ids = keyframes.ids
+    along = keyframes.poses(ids)[:, 2, :3] @ T_cw[2, :3]
+    nearest = along.argsort(descending=True, stable=True)[:MAX_FACING].tolist()
+    facing = [keyframes[ids[n]] for n in nearest]
     there, _ = grid_fields(grid).reproject(facing, [T_cw] * len(facing))
     known = torch.stack([k.has_known_depth for k in facing])
     seen = (grid.inside(there) & known).float().mean(1).tolist()

@@ -18,7 +18,8 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import OrientationTrack, ReferenceView
 
 MAX_MISSES = 5
-"""Frames without a match after which the next frame replaces the view, without a link."""
+"""Frames without a match after which the next frame replaces the view, without a link, or an
+unsuccessful start begins anew."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,9 @@ class OrientationFollower:
     """
 
     def __init__(self, grid: SampleGrid, operator: FlowOperator, config: TrackingConfig) -> None:
-        self.grid, self.operator, self.config = grid, operator, config
+        self.grid = grid
+        self.operator = operator
+        self.config = config
 
     def located(self, track: OrientationTrack, frame: Frame, encoded: Any) -> None:
         """Use a located frame as the view for later ones."""
@@ -55,10 +58,10 @@ class OrientationFollower:
             return None
         if view.encoded is None:
             view.encoded = self.operator.encode(view.image)
-        match = follow_flow(self.grid, self.operator, track.flow, view.encoded, encoded)
+        motion = follow_flow(self.grid, self.operator, track.flow, view.encoded, encoded)
         found = None
-        if match.matched >= MIN_MATCHED:
-            found = two_view_rotation(self.grid, match.there)
+        if motion.overlap >= MIN_MATCHED:
+            found = two_view_rotation(self.grid, motion.match)
         if found is None:
             track.misses += 1
             if track.misses >= MAX_MISSES:
@@ -66,7 +69,7 @@ class OrientationFollower:
             return None
         track.misses = 0
         R = None if view.R is None else found.R @ view.R
-        if calls_for_keyframe(self.config, self.grid, match.seen):
+        if calls_for_keyframe(self.config, self.grid, motion):
             track.reset(ReferenceView(frame.index, frame.image, R, encoded))
         rotation = RelativeRotation(view.index, found.R, found.deviation)
         return Followed(rotation, R, found.is_pure)

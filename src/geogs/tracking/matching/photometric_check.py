@@ -73,7 +73,8 @@ def correlation_at(
     if grid.on_gpu:
         from geogs.tracking.cuda.photometric_check import median_correlation
 
-        step, at = _spread(grid).step, (to_device(T_ji, first.device), inverse_depth, information)
+        step = _spread(grid).step
+        at = (to_device(T_ji, first.device), inverse_depth, information)
         return median_correlation(grid, first, second, step, MIN_CONTRAST**2, *at)
     some = _spread(grid)
     positions = reprojected_windows(grid, T_ji, inverse_depth)
@@ -125,8 +126,10 @@ def reprojected_windows(
     The surface in a window is assumed to have its cell's depth: the window is rotated, scaled and
     sheared like that plane. Pixels that are not in front of the second camera are not finite.
     """
-    c, some = grid.camera, _spread(grid)
-    R, t = T_ji[:3, :3].to(grid.rays), T_ji[:3, 3].to(grid.rays)
+    c = grid.camera
+    some = _spread(grid)
+    R = T_ji[:3, :3].to(grid.rays)
+    t = T_ji[:3, 3].to(grid.rays)
     middle = grid.rays[some] @ R.mT + inverse_depth[some, None] * t
     around = _offsets(grid) @ torch.stack([R[:, 0] / c.fx, R[:, 1] / c.fy])
     x, y, z = (middle[:, None] + around).unbind(-1)
@@ -148,7 +151,8 @@ def _median_correlation(
     position = position.nan_to_num(0.0).clamp(-2, 2)
     there = functional.grid_sample(second[None, None], position[None], align_corners=True)[0, 0]
     a, b = (_smoothed(x) for x in (_windows(grid, first), there))
-    contrast, other = a.square().mean(1), b.square().mean(1)
+    contrast = a.square().mean(1)
+    other = b.square().mean(1)
     ncc = (a * b).mean(1) / (contrast * other).sqrt().clamp(min=1e-6)
     return _median_where(ncc, known & seen & (contrast > MIN_CONTRAST**2))
 

@@ -32,7 +32,8 @@ def pnp_features(
     """Estimate the pose T_ji of a view from features of a keyframe, with depths of their cells."""
     cell, inside = grid.cells_of(matches.first.to(grid.device))
     known = inside & (keyframe.information[cell] > 0)
-    c, p = grid.camera, matches.first.to(grid.device)
+    c = grid.camera
+    p = matches.first.to(grid.device)
     rays = torch.stack([(p[:, 0] - c.cx) / c.fx, (p[:, 1] - c.cy) / c.fy, p[:, 0] * 0 + 1], -1)
     points = (rays / keyframe.inverse_depth[cell, None])[known]
     return _pnp(c, points, matches.second.to(grid.device)[known], MIN_POINTS[1])
@@ -56,5 +57,6 @@ def _pnp(
     if not ok or inliers is None or len(inliers) < 0.3 * len(points):
         return None
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    T[:3, :3] = cv2.Rodrigues(rotation)[0]
+    T[:3, 3] = translation[:, 0]
     return torch.from_numpy(T) if np.isfinite(T).all() else None

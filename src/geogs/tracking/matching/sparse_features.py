@@ -61,13 +61,15 @@ def match_features(
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     back = {m.queryIdx: m.trainIdx for m in matcher.match(b, a)}
     pairs = [
-        (best.queryIdx, best.trainIdx)
+        [best.queryIdx, best.trainIdx]
         for best, other in matcher.knnMatch(a, b, 2)
         if best.distance < MAX_RATIO * other.distance and back[best.trainIdx] == best.queryIdx
     ]
     if len(pairs) < MIN_MATCHES:
         return None
-    p, q = (np.stack(x) for x in ([points_a[i] for i, _ in pairs], [points_b[j] for _, j in pairs]))
+    i, j = np.array(pairs).T
+    p = points_a[i]
+    q = points_b[j]
     try:
         F, agree = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 2000)
     except cv2.error:  # OpenCV 5 fails an assertion where no sample gives a model
@@ -120,10 +122,12 @@ def spread_positions(
 ) -> Float[Tensor, "p 2"]:
     """Interpolate the motion of points, which go to ``moved``, at the cells of an image."""
     cell, inside = grid.cells_of(points)
-    cell, flow = cell[inside], (moved - points)[inside]
+    cell = cell[inside]
+    flow = (moved - points)[inside]
     total = torch.zeros(grid.size, 2).index_add_(0, cell, flow)
     count = torch.zeros(grid.size).index_add_(0, cell, torch.ones(len(cell)))
-    mean, count = (total / count.clamp(min=1)[:, None]).to(grid.device), count.to(grid.device)
+    mean = (total / count.clamp(min=1)[:, None]).to(grid.device)
+    count = count.to(grid.device)
     return grid.pixels + grid_fields(grid).fill(mean.mT.contiguous(), count.expand(2, -1)).mT
 
 

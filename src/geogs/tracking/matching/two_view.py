@@ -152,17 +152,21 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
         return None
     T, inliers = found
     p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
-    K, count = camera.matrix().numpy(), len(p)
+    K = camera.matrix().numpy()
+    count = len(p)
     homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p[inliers].T, q[inliers].T)
     z = homogeneous[2] / np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
     median = np.median(z[z > 0])
     near = (z > 0.1 * median) & (z < 10 * median)
-    z, inliers = z[near], inliers[near]
+    z = z[near]
+    inliers = inliers[near]
     rotated = rays_through(p[inliers], K) @ (K @ T[:3, :3]).T
     parallax = np.median(np.linalg.norm(q[inliers] - rotated[:, :2] / rotated[:, 2:], axis=1))
     T[:3, 3] /= median
-    depth, known = torch.ones(count), torch.zeros(count, dtype=torch.bool)
-    depth[inliers], known[inliers] = torch.from_numpy(median / z).float(), True
+    depth = torch.ones(count)
+    known = torch.zeros(count, dtype=torch.bool)
+    depth[inliers] = torch.from_numpy(median / z).float()
+    known[inliers] = True
     none = torch.zeros(count, dtype=torch.bool)
     return TwoView(torch.from_numpy(T), depth, known, float(parallax), apart=none)
 
@@ -191,7 +195,8 @@ def relative_pose(
     if in_front.sum() < 0.3 * used.sum():
         return None
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
+    T[:3, :3] = R
+    T[:3, 3] = t
     return T, agreeing[in_front]
 
 
@@ -214,7 +219,8 @@ def _pose_of(
     depths follow by the cross products with b and with R a.
     """
     R1, R2, t = cv2.decomposeEssentialMat(E)
-    t, best = t[:, 0], None
+    t = t[:, 0]
+    best = None
     for R in (R1, R2):
         rotated = first @ R.T
         across = np.cross(rotated, second)
@@ -222,7 +228,8 @@ def _pose_of(
         z_first = -(np.cross(t, second) * across).sum(1) / square
         z_second = -(np.cross(t, rotated) * across).sum(1) / square
         for sign in (1.0, -1.0):
-            z, other = sign * z_first, sign * z_second
+            z = sign * z_first
+            other = sign * z_second
             seen = (z > 0) & (z < MAX_BASELINES) & (other > 0) & (other < MAX_BASELINES)
             if best is None or seen.sum() > best[2].sum():
                 best = R, sign * t, seen

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.tracking.matching.two_view import rays_through, relative_pose
 from geogs.types import FlowMatch
@@ -21,7 +20,7 @@ from geogs.world.grid import SampleGrid
 
 AGREEING = 0.4
 """Fraction of the matched cells that must agree with a rotation for it to be accepted."""
-SHARPENED = (0.1, 0.03, 0.01, 0.005, 0.005)
+SHARPENED = (0.1, 0.1, 0.03, 0.03, 0.01, 0.01, 0.005, 0.005, 0.005, 0.005)
 """Scales of the robust loss, step by step, as fractions of the long edge."""
 TOLERANCE = 0.008
 """Largest residual of a cell that agrees with a rotation, as a fraction of the long edge."""
@@ -98,7 +97,8 @@ def gric(squares: Float64[np.ndarray, "n"], dimension: int, parameters: int) -> 
             predicts a point, 3 where it only predicts a line.
         parameters: number of the model's parameters.
     """
-    n, codimension = len(squares), 4 - dimension
+    n = len(squares)
+    codimension = 4 - dimension
     robust = float(np.minimum(squares, 2 * codimension).sum())
     return robust + dimension * n * math.log(4) + parameters * math.log(4 * max(n, 1))
 
@@ -109,7 +109,8 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     Gauss-Newton on the distances in the second image under Geman and McClure's loss, whose scale
     shrinks from step to step. None where fewer than eight cells are matched.
     """
-    camera, used = grid.camera, (match.weight[0, :, 0] > 0).cpu().numpy()
+    camera = grid.camera
+    used = (match.weight[0, :, 0] > 0).cpu().numpy()
     if used.sum() < 8:
         return None
     rays = grid.rays.double().cpu().numpy()[used]
@@ -122,32 +123,19 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))
     R = nearest_rotation(second.T @ first)
     some = slice(None, None, -(-len(pixels) // MOST_CELLS))
+    damping = 1e-9 * np.eye(3)
     H = np.zeros((3, 3))
     for reach in SHARPENED:
-
-        def linearised(
-            R: Float64[np.ndarray, "3 3"], reach: float = reach
-        ) -> Float64[np.ndarray, "3"]:
-            """Return the gradient; keep the Hessian, also for the deviation."""
-            nonlocal H
-            error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
-            square = (error**2).sum(1, keepdims=True) / (reach * edge) ** 2
-            robust = weight[some] / (1 + square) ** 2
-            weighted = (robust[..., None] * J).reshape(-1, 3).T
-            H = weighted @ J.reshape(-1, 3)
-            gradient: Float64[np.ndarray, "3"] = weighted @ error.reshape(-1)
-            return gradient
-
-        def step(
-            R: Float64[np.ndarray, "3 3"], gradient: Float64[np.ndarray, "3"], damping: float
-        ) -> Step[Float64[np.ndarray, "3 3"]]:
-            return Step(_exponential(np.linalg.solve(H + damping * np.eye(3), gradient)) @ R)
-
-        R = minimise(R, linearised, step, Policy(2, damping=1e-9)).state
+        error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
+        square = (error**2).sum(1, keepdims=True) / (reach * edge) ** 2
+        robust = weight[some] / (1 + square) ** 2
+        weighted = (robust[..., None] * J).reshape(-1, 3).T
+        H = weighted @ J.reshape(-1, 3)
+        R = _exponential(np.linalg.solve(H + damping, weighted @ error.reshape(-1))) @ R
     error, _ = _linearised(rays @ R.T, pixels, focal, centre)
     agreeing = float((np.linalg.norm(error, axis=1) < TOLERANCE * edge).mean())
     H *= len(pixels) / len(pixels[some])
-    deviation = max(math.sqrt(np.trace(np.linalg.inv(H + 1e-9 * np.eye(3)))), LEAST_DEVIATION)
+    deviation = max(math.sqrt(np.trace(np.linalg.inv(H + damping))), LEAST_DEVIATION)
     return RotationFit(torch.from_numpy(R), agreeing, deviation, (weight * error**2).sum(1))
 
 
@@ -155,8 +143,10 @@ def epipolar_squares(
     grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]
 ) -> Float64[np.ndarray, "n"]:
     """Return squared epipolar distances of the matched cells, in the flow's variances."""
-    camera, used = grid.camera, match.weight[0, :, 0] > 0
-    t, R = T_ji[:3, 3].double().numpy(), T_ji[:3, :3].double().numpy()
+    camera = grid.camera
+    used = match.weight[0, :, 0] > 0
+    t = T_ji[:3, 3].double().numpy()
+    R = T_ji[:3, :3].double().numpy()
     rotated = grid.rays.cpu().double().numpy()[used.numpy()] @ R.T
     normal = np.cross(t, rotated)  # of the epipolar plane
     line = normal[:, :2] / [camera.fx, camera.fy]
@@ -177,9 +167,7 @@ def _linearised(
     """Return residuals of projections, and their derivatives by a rotation on the left."""
     z = np.maximum(points[:, 2], 1e-3)
     x, y = points[:, 0] / z, points[:, 1] / z
-    J = np.stack([
-        np.stack([-x * y, 1 + x * x, -y], -1), np.stack([-1 - y * y, x * y, x], -1),
-    ], 1)  # fmt: skip
+    J = np.stack([np.stack([-x * y, 1 + x * x, -y], -1), np.stack([-1 - y * y, x * y, x], -1)], 1)
     return pixels - (focal * np.stack([x, y], -1) + centre), J * focal[:, None]
 
 

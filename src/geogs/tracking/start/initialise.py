@@ -24,11 +24,7 @@ from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
 from geogs.tracking.graph.proximity import RADIUS
 from geogs.tracking.graph.rigid_parts import largest_part
-from geogs.tracking.matching.photometric_check import (
-    MIN_NCC,
-    PhotometricCheck,
-    correlation_at,
-)
+from geogs.tracking.matching.photometric_check import MIN_NCC, PhotometricCheck, correlation_at
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.tracking.matching.two_view import TwoView, best_two_view
@@ -70,10 +66,7 @@ class Attempt(Enum):
 
 
 def initialise(
-    graph: FrameGraph,
-    config: TrackingConfig,
-    flows: Sequence[FlowMatch],
-    most_open: float,
+    graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch], most_open: float
 ) -> Attempt:
     """Estimate all keyframes of the graph from the flows from the first to the others alone.
 
@@ -107,7 +100,8 @@ def polished(graph: FrameGraph, config: TrackingConfig, most_open: float) -> Att
     """Adjust keyframes with approximate poses and depths, and decide whether to start."""
     if not _polish(graph, config.moving, range(FORGIVING, ROUNDS)):
         return Attempt.FAILED
-    segment, deviation = graph.keyframes, _depth_deviation(graph)
+    segment = graph.keyframes
+    deviation = _depth_deviation(graph)
     if deviation > FAR * most_open:
         return Attempt.FAR_OFF
     if not largest_part(segment, graph.edges).issuperset(segment.ids):
@@ -126,7 +120,8 @@ def has_moved_surely(
     ``focal_deviation``, 0 where it was given. Only confident cells count: guesses on a bare wall
     agree with both, and each would support the simpler model.
     """
-    sure, moved = match.only_sure(), (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
+    sure = match.only_sure()
+    moved = (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
     error = min(GIVEN_ERROR + 0.1 * focal_deviation, MODEL_ERROR)
     weight = sure.weight / (1 + sure.weight * (error * moved).square())
     unsure = replace(sure, weight=weight)
@@ -141,16 +136,19 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
     """
     segment = graph.keyframes
     chosen, view = best
-    keyframes, fields = list(segment), grid_fields(segment.grid)
+    keyframes = list(segment)
+    fields = grid_fields(segment.grid)
     first = keyframes[0]
-    device, grid = segment.grid.device, SampleGrid(segment.grid.camera)
+    device = segment.grid.device
+    grid = SampleGrid(segment.grid.camera)
     for keyframe in keyframes:
         keyframe.moving = None  # a failed attempt marked moving cells by wrong poses
     if view.apart.any():
         held = [view.apart, *(_carried(grid, view.apart, match) for match in flows)]
         for keyframe, cells in zip(keyframes, held, strict=True):
             keyframe.moving = cells.to(device)
-    first.T_cw, known = torch.eye(4, dtype=torch.float64), view.good
+    first.T_cw = torch.eye(4, dtype=torch.float64)
+    known = view.good
     first.information = known.float().to(device)
     first.inverse_depth = fields.fill(view.inverse_depth.to(device), first.information)
     depth = first.inverse_depth.cpu()
@@ -178,7 +176,8 @@ def _carried(grid: SampleGrid, cells: Bool[Tensor, "p"], match: FlowMatch) -> Bo
 
 def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
     """Estimate a pose by PnP on the depth of the keyframe before, or return that one's pose."""
-    grid, pair = graph.keyframes.grid, [before.encoded, keyframe.encoded]
+    grid = graph.keyframes.grid
+    pair = [before.encoded, keyframe.encoded]
     ((match, _),) = guided_flows(grid, graph.operator, pair[:1], pair[1:])
     good = match.sure()[0]
     if before.moving is not None:
@@ -189,7 +188,8 @@ def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Flo
 
 def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
     """Run rounds of flow and adjustment, from tolerant to strict, then without moving cells."""
-    segment, ids = graph.keyframes, graph.keyframes.ids
+    segment = graph.keyframes
+    ids = graph.keyframes.ids
     near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + RADIUS]]
     for n in rounds:
         graph.measure(graph.stale(near, 0.25), fine=n >= FORGIVING)
@@ -213,7 +213,9 @@ def _depth_deviation(graph: FrameGraph) -> float:
 
 def _passes_photometric_check(graph: FrameGraph) -> bool:
     """Whether all consecutive keyframes pass the photometric check."""
-    keyframes, grey, found = graph.keyframes, graph.operator.grey, []
+    keyframes = graph.keyframes
+    grey = graph.operator.grey
+    found = []
     pairs = list(pairwise(keyframes.ids))
     for (i, j), T_ji in zip(pairs, keyframes.relative_poses(pairs), strict=True):
         first, second = keyframes[i], keyframes[j]

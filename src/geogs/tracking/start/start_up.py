@@ -8,14 +8,15 @@ from typing import Any
 import torch
 
 from geogs.config import TrackingConfig
+from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
+from geogs.tracking.frames.rotation_averaging import orientations
 from geogs.tracking.graph.rigid_parts import largest_part
 from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import MIN_KNOWN
-from geogs.tracking.matching.flow_chain import MIN_MATCHED, follow_flow
+from geogs.tracking.locate.orientation_follower import MAX_MISSES
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, ChainedFlows, follow_flow
 from geogs.tracking.matching.two_view_rotation import two_view_rotation
-from geogs.tracking.start.chained_flows import ChainedFlows
-from geogs.tracking.start.early_frames import place_between_keyframes
 from geogs.tracking.start.initialise import (
     LAST_DEVIATION,
     MAX_DEVIATION,
@@ -24,29 +25,32 @@ from geogs.tracking.start.initialise import (
     polished,
 )
 from geogs.types import FlowMatch, Frame
-from geogs.world.frames import RelativeRotation
+from geogs.world.frames import FrameLog, RelativeRotation
 from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeSet
 from geogs.world.segments import TrackState
 
 MIN_KEYFRAMES = 4
 MIN_OVERLAP = 0.3
 """Fraction of the first keyframe that the last still has to see for the first to be kept, while the
 map cannot be started."""
-MAX_MISSES = 5
-"""Frames without a match after which an unsuccessful start begins anew."""
 MORE = 0.25
 """Fraction of additional keyframes before a start that was far off is tried again."""
+MAX_DISAGREEMENT = 0.05
+"""Largest difference, in radians, of a frame's orientation from the interpolated one."""
 
 
 class StartUp:
     """Chooses keyframes by the flow since the last, and starts the map when there are enough."""
 
     def __init__(self, map: SegmentMap, choice: KeyframeChoice, config: TrackingConfig) -> None:
-        self.map, self.config, self._choice = map, config, choice
+        self.map = map
+        self.config = config
+        self._choice = choice
         self.keyframes = map.keyframes
         self._grid = SampleGrid(map.keyframes.grid.camera)
         """Grid on the CPU, where rotations are measured."""
-        self._flows = ChainedFlows(map.graph)
+        self._flows = ChainedFlows(map.keyframes, map.operator)
         self._progress = map.segment.start
         self._hardly_moved = False
         """Whether the images moved too little for the keyframes that a start needs."""
@@ -62,19 +66,19 @@ class StartUp:
             self._gather(frame, encoded, rotations)
             return
         last = list(self.keyframes)[-1]
-        match = follow_flow(
+        motion = follow_flow(
             self.keyframes.grid, self.map.operator, self._progress.flow, last.encoded, encoded
         )
-        if match.matched < MIN_MATCHED:
+        if motion.overlap < MIN_MATCHED:
             self._miss(frame, encoded, rotations)
             return
         self._progress.misses = 0
-        measure = partial(_rotation, last.frame_index, self._grid, match.there.on_cpu())
-        if self._choice.calls_for(match.seen):
+        measure = partial(_rotation, last.frame_index, self._grid, motion.match.on_cpu())
+        if self._choice.calls_for(motion):
             self._gather(frame, encoded, rotations, measure)
             return
         eye = torch.eye(4, dtype=torch.float64)
-        self.map.recorder.add(frame, encoded, last.id, eye, match.there, rotations)
+        self.map.recorder.add(frame, encoded, last.id, eye, motion.match, rotations)
         self.map.recorder.measure_rotation(measure)
 
     def finish(self) -> bool:
@@ -120,14 +124,16 @@ class StartUp:
         """Make keyframes of frames that are evenly spaced in time."""
         self._forget(self.keyframes.ids)
         frames = self.map.recorder.unplaced()
-        last, count = len(frames) - 1, min(len(frames), self.config.init_keyframes)
+        last = len(frames) - 1
+        count = min(len(frames), self.config.init_keyframes)
         for n in range(count if count >= MIN_KEYFRAMES else 0):
             eye = torch.eye(4, dtype=torch.float64)
             self.map.restore(frames[n * last // (count - 1)], None, eye)
 
     def _start_with_part(self, most_open: float) -> Attempt:
         """Try to start with the largest rigidly connected part, dropping the other keyframes."""
-        graph, keyframes = self.map.graph, self.keyframes
+        graph = self.map.graph
+        keyframes = self.keyframes
         part = largest_part(keyframes, graph.edges)
         if len(part) < MIN_KEYFRAMES:
             return Attempt.FAILED
@@ -142,7 +148,8 @@ class StartUp:
         """Start the map at once from sensor depth; False where there is too little."""
         earlier = self.keyframes.ids
         keyframe = self.map.add(frame, encoded)
-        if not self.map.sensor.start(keyframe, frame.depth, MIN_KNOWN):
+        has_depth = self.map.add_sensor_depth(keyframe, frame.depth)
+        if not has_depth or float(keyframe.has_known_depth.float().mean()) < MIN_KNOWN:
             self.keyframes.remove(keyframe.id)
             return False
         self._forget(earlier)
@@ -164,7 +171,8 @@ class StartUp:
         self.map.complete(keyframe, rotations)
         if measure is not None:
             self.map.recorder.measure_rotation(measure)
-        count, wanted = len(self.keyframes), self.config.init_keyframes
+        count = len(self.keyframes)
+        wanted = self.config.init_keyframes
         if count < max(wanted, MIN_KEYFRAMES):
             return
         if count >= self._progress.min_keyframes:
@@ -213,3 +221,32 @@ def _rotation(earlier: int, grid: SampleGrid, match: FlowMatch) -> RelativeRotat
     """Estimate the rotation of a frame relative to an earlier one by the flow; all on the CPU."""
     found = two_view_rotation(grid, match)
     return None if found is None else RelativeRotation(earlier, found.R, found.deviation)
+
+
+def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
+    """Interpolate poses of the frames of a start between their keyframes.
+
+    A frame whose relative rotations contradict its pose loses it: the camera then faced away from
+    both keyframes.
+    """
+    ordered = list(keyframes)
+    oriented = orientations(
+        {r.index: r.rotations for r in log.records},
+        {k.frame_index: k.T_cw[:3, :3] for k in ordered},
+    )
+    for record in log.records:
+        if record.anchor is None or record.anchor not in keyframes:
+            continue
+        n = keyframes.ids.index(record.anchor)
+        a = ordered[n]
+        b = ordered[min(n + 1, len(ordered) - 1)]
+        span = max(b.frame_index - a.frame_index, 1)
+        fraction = (record.index - a.frame_index) / span
+        xi = se3_log(b.T_cw @ se3_inverse(a.T_cw))
+        record.T_rel = retract(fraction * xi, torch.eye(4).to(xi))
+        record.scale = a.scale
+        R = oriented.get(record.index)
+        if R is not None:
+            angle = so3_log(R @ (record.T_rel @ a.T_cw)[:3, :3].mT).norm()
+            if float(angle) > MAX_DISAGREEMENT:
+                record.anchor = None

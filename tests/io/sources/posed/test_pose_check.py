@@ -9,7 +9,7 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.posed.conventions import conventions_for
 from geogs.io.sources.posed.matching import Matcher
-from geogs.io.sources.posed.pose_check import check_poses, judge
+from geogs.io.sources.posed.pose_check import check_poses, judge, with_focal_length
 from geogs.io.sources.sniff import open_posed_source
 from io_samples import write_image
 from posed_layouts import (
@@ -73,7 +73,7 @@ MISTAKES = {
 def test_true_poses_pass(room, folder):
     check = check_poses(with_poses(folder, room.T_wc))
     assert check.warning is None
-    assert check.pairs == 8
+    assert check.pairs == 13  # all images
     assert check.given.error < 0.0015  # 0.5 pixels
     assert check.given.in_front > 0.97
 
@@ -139,6 +139,73 @@ def test_poses_of_other_images_only_warn(room, folder, matched):
     shuffled = room.T_wc[np.random.default_rng(1).permutation(len(room.T_wc))]
     check = judge(with_poses(folder, shuffled), *matched)
     assert "explain the images badly" in check.warning
+
+
+def with_camera(room, folder, **changed):
+    """The source of ``folder`` with true poses and other intrinsics."""
+    source = with_poses(folder, room.T_wc)
+    c = source.camera
+    numbers = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "k1": 0, "k2": 0, "p1": 0, "p2": 0}
+    words = ",".join(str(value) for value in (numbers | changed).values())
+    return open_posed_source(folder, InputConfig(long_edge=0, intrinsics=words))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"fx": 160.0, "fy": 162.3}, r"focal length of 22[345] pixels, not 160"),
+        ({"fx": 310.0, "fy": 314.4}, r"focal length of 22[345] pixels, not 310"),
+        ({"fx": 280.0}, r"fy / fx = 1\.01\d, not 0\.811"),
+        ({"k1": -0.3}, r"at the rim, as where a lens"),
+    ],
+    ids=["wide", "narrow", "squeezed", "bent"],
+)
+def test_intrinsics_that_do_not_fit_are_refused(changed, message, room, folder):
+    with pytest.raises(InputError, match=message):
+        check_poses(with_camera(room, folder, **changed))
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.0, 1.02])
+def test_intrinsics_that_are_nearly_right_pass(factor, room, folder):
+    c = room.camera
+    source = with_camera(room, folder, fx=c.fx * factor, fy=c.fy * factor)
+    assert check_poses(source).warning is None
+
+
+def test_an_unknown_focal_length_is_told_by_poses_and_images(room, tmp_path):
+    write_replica(room, tmp_path)
+    (tmp_path / "cam_params.json").unlink()
+    assumed = open_posed_source(tmp_path, NATIVE)
+    assert assumed.is_focal_guess
+    assert "assumed" in assumed.account.used[0]
+    found = with_focal_length(assumed)
+    assert found.camera.fx == pytest.approx(226.5, rel=0.01)  # of pixels that are 1.4 % from square
+    assert "estimated from images and poses" in found.account.used[0]
+    assert with_focal_length(found) is found
+
+
+def test_a_focal_length_that_images_do_not_tell_is_asked_for(room, tmp_path):
+    write_replica(room, tmp_path)
+    (tmp_path / "cam_params.json").unlink()
+    for path in (tmp_path / "results").iterdir():
+        write_image(path, np.full((240, 320, 3), 90, dtype=np.uint8))
+    with pytest.raises(InputError, match="give --intrinsics"):
+        with_focal_length(open_posed_source(tmp_path, NATIVE))
+
+
+def test_mirrored_images_and_poses_of_the_neighbours_are_named(room, folder, matched):
+    flip = np.diag([-1.0, 1.0, 1.0, 1.0])
+    with pytest.raises(InputError, match="mirrored"):
+        judge(with_poses(folder, flip @ room.T_wc @ flip), *matched)
+    with pytest.raises(InputError, match=r"poses of the (next image|image before)"):
+        judge(with_poses(folder, np.roll(room.T_wc, 1, axis=0)), *matched)
+
+
+def test_a_single_wrong_pose_is_named(room, folder, matched):
+    T_wc = room.T_wc.copy()
+    T_wc[6, :3, 3] += 0.5
+    check = judge(with_poses(folder, T_wc), *matched)
+    assert "frame000006" in check.warning
 
 
 def test_images_without_texture_cannot_be_checked(room, tmp_path):

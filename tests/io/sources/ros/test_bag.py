@@ -82,6 +82,105 @@ def test_bayer_patterns_are_named_by_their_first_row(tmp_path):
     np.testing.assert_array_equal(image[4:-4, 4:-4].reshape(-1, 3).max(axis=0), [200, 0, 0])
 
 
+def as_bytes(deep: np.ndarray, order: str = "<") -> np.ndarray:
+    """Values of 16 bits as the bytes of their rows."""
+    return np.ascontiguousarray(deep.astype(f"{order}u2")).view(np.uint8).reshape(len(deep), -1)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+@pytest.mark.parametrize(
+    ("encoding", "order"), [("rgb16", "<"), ("bgr16", "<"), ("mono16", ">"), ("16UC1", "<")]
+)
+def test_images_of_16_bits_are_read_by_the_bits_in_use(tmp_path, encoding, order, bits):
+    with BagWriter(tmp_path, "mcap") as bag:
+        for k in range(3):
+            image = gradient_image(k)
+            values = {"rgb16": image, "bgr16": image[..., ::-1]}.get(encoding, image[..., 1])
+            rows = as_bytes(values.astype(np.uint16) << (bits - 8), order)
+            bag.rows("/camera/image", k, rows, encoding, is_bigendian=order == ">")
+    source = geogs.open_source(bag.path, NATIVE)
+    image = list(source)[2].image
+    true = gradient_image(2)
+    expected = true if encoding in ("rgb16", "bgr16") else true[..., [1]]
+    np.testing.assert_array_equal(image, np.broadcast_to(expected, true.shape))
+    said = f"pictures use {bits} of their 16 bits"
+    assert (said in source.account.used) == (bits < 16)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_thermal_camera_is_stretched_alike_in_all_images(tmp_path, kind):
+    with BagWriter(tmp_path, kind) as bag:
+        for k in range(4):
+            bag.rows(
+                "/flir/image_raw", k, as_bytes(gradient_image(k)[..., 1] + np.uint16(7400)), "16UC1"
+            )
+    images = [f.image for f in geogs.open_source(bag.path, NATIVE)]
+    assert np.ptp(images[0]) > 190
+    np.testing.assert_array_equal(images[0], images[3])
+
+
+@pytest.mark.parametrize(("encoding", "swap"), [("nv12", False), ("nv21", True), ("i420", None)])
+def test_images_with_rows_of_colour(tmp_path, encoding, swap):
+    planes = cv2.cvtColor(gradient_image(9), cv2.COLOR_RGB2YUV_I420)
+    if swap is not None:
+        u, v = planes[48:].reshape(2, -1)
+        colours = np.stack((v, u) if swap else (u, v), axis=1)
+        planes = np.concatenate([planes[:48], colours.reshape(24, 64)])
+    with BagWriter(tmp_path, "sqlite") as bag:
+        bag.rows("/image", 0, planes, encoding)
+    image = next(iter(geogs.open_source(bag.path, NATIVE))).image
+    assert np.abs(image.astype(int) - gradient_image(9)).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("encoding", "at"), [("uyvy", 1), ("yuv422", 1), ("yuyv", 0), ("yuv422_yuy2", 0), ("yuy2", 0)]
+)
+def test_images_with_two_bytes_a_pixel(tmp_path, encoding, at):
+    """Grey: brightness in every second byte, 128 in the others."""
+    rows = np.full((48, 128), 128, np.uint8)
+    rows[:, at::2] = np.linspace(16, 235, 64).astype(np.uint8)
+    with BagWriter(tmp_path, "bag") as bag:
+        bag.rows("/image", 0, rows, encoding)
+    image = next(iter(geogs.open_source(bag.path, NATIVE))).image
+    np.testing.assert_allclose(image[5, :, 0], np.linspace(0, 255, 64), atol=3)
+
+
+@pytest.mark.parametrize(
+    "encoding", ["bayer_rggb16", "bayer_bggr16", "bayer_gbrg16", "bayer_grbg16"]
+)
+def test_bayer_patterns_of_16_bits(tmp_path, encoding):
+    at = encoding[6:10].index("r")
+    red = np.zeros((48, 64), np.uint16)
+    red[at // 2 :: 2, at % 2 :: 2] = 4000
+    with BagWriter(tmp_path, "bag") as bag:
+        bag.rows("/image", 0, as_bytes(red), encoding)
+    image = next(iter(geogs.open_source(bag.path, NATIVE))).image
+    np.testing.assert_array_equal(image[4:-4, 4:-4].reshape(-1, 3).max(axis=0), [250, 0, 0])
+
+
+@pytest.mark.parametrize("has_camera", [False, True])
+def test_colour_is_preferred_to_a_grey_fisheye_and_depth_is_no_image(tmp_path, has_camera):
+    grey = np.repeat(gradient_image(0)[..., [1]], 3, axis=2)
+    with BagWriter(tmp_path, "mcap") as bag:
+        bag.camera_info("/fisheye/camera_info", 0, (0.1, 0.0, 0.0, 0.0), "equidistant")
+        if has_camera:
+            bag.camera_info("/color/camera_info", 0)
+        for k in range(3):
+            bag.image("/fisheye/image_raw", k, gradient_image(k), "mono8")
+            bag.compressed("/a_grey/image/compressed", k, grey, "jpeg")
+            bag.compressed("/color/image_raw/compressed", k, gradient_image(k), "jpeg")
+            bag.depth("/aligned_depth/image_raw", k, np.full((48, 64), 1500, np.uint16))
+    source = geogs.open_source(bag.path, NATIVE)
+    assert source._recordings[0].reader.topic == "/color/image_raw/compressed"
+    assert "images: topic /color/image_raw/compressed" in source.account.used
+    assert source.account.left == (
+        "images of /a_grey/image/compressed, /fisheye/image_raw: --topic takes another",
+        "depth of /aligned_depth/image_raw: that of bags is not read",
+    )
+    with pytest.raises(InputError, match="/aligned_depth/image_raw shows depth, not images"):
+        geogs.open_source(bag.path, InputConfig(topic="/aligned_depth/image_raw"))
+
+
 def test_the_likeliest_topic_is_read_and_another_can_be_asked_for(tmp_path):
     with BagWriter(tmp_path, "sqlite") as bag:
         bag.camera_info("/d400/color/camera_info", 0)
@@ -181,3 +280,13 @@ def test_bags_that_cannot_be_read_say_so(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(InputError, match=r"pip install 'geogs\[ros\]'"):
         geogs.open_source(bag.path)
+
+
+def test_a_damaged_first_message_hides_no_topic(tmp_path):
+    with BagWriter(tmp_path, "mcap") as bag:
+        bag.broken("/image/compressed", -1)
+        for k in range(3):
+            bag.compressed("/image/compressed", k, gradient_image(k), "png")
+    source = geogs.open_source(bag.path, NATIVE)
+    assert len(list(source)) == 3
+    assert source.place.skipped == 1

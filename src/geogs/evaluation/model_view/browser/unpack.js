@@ -1,4 +1,4 @@
-// Undoes what packing.py does.
+// Undoes what model_section.py does.
 
 const base64Bytes = (text) => {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);

@@ -52,7 +52,8 @@ def open_arkitscenes(place: Place) -> ImageList:
     timed = sorted((float(match[1]), path) for match, path in found if match)
     if not timed:
         raise InputError(f"{place.pictures} holds no images such as 41069021_305.377.png.")
-    depths, trust = place.folder / "lowres_depth", place.folder / "confidence"
+    depths = place.folder / "lowres_depth"
+    trust = place.folder / "confidence"
     names = [f"{path.stem}.png" for _, path in timed]
     files = [
         ImageFile(path, time, depth_beside(depths / name, trust / name))

@@ -5,39 +5,36 @@ https://colmap.github.io/format.html. Two-dimensional keypoints are skipped: onl
 images that see each point are kept.
 """
 
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
-from geogs.documents import read_bytes, read_text
+from geogs.documents import first_file, read_bytes, read_text
 from geogs.errors import InputError
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.io.pose_files import FRAMES_PER_SECOND
-from geogs.io.sources.calibration_files import calibration_from_colmap
+from geogs.io.sources.account import Account, named
+from geogs.io.sources.calibration_files import COLMAP_MODELS, calibration_from_colmap
 from geogs.io.sources.formats.image_files import natural_key
+from geogs.io.sources.named_files import IMAGE_FOLDERS, NamedFiles, elsewhere, unlisted
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet, SparsePoints, renumbered
+from geogs.io.sources.posed.stored_pictures import of_stored_pixels
 
-_MODEL_FOLDERS = ("", "0", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "iphone/colmap")
-_IMAGE_FOLDERS = (
-    "images", "image", "rgb", "color", "frames", "input", "resized_images", "original_images", "",
-)  # fmt: skip
-_PROJECT_FOLDERS = (
-    "sparse", "colmap", "0", "iphone", "dslr_calibration_undistorted", "dslr_calibration_jpg",
-)  # fmt: skip
-_MODELS = (
-    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-)  # fmt: skip
-"""Name and number of parameters by the number of the model in binary files."""
-
+_MODEL_FOLDERS = ("", "sparse", "colmap/sparse", "colmap", "iphone/colmap")
+"""Folders of a model in a project, or of several in folders called 0, 1, ..."""
+_PROJECT_FOLDERS = re.compile(
+    r"sparse|colmap|\d+|iphone|dslr_calibration_undistorted|dslr_calibration_jpg"
+)
 _TABLES = ("cameras", "images")
+_KEYPOINTS = re.compile(r"(?:[-+.\deE\s]++|nan|inf)++")
+Row = TypeVar("Row")
 LARGEST_TABLE = 1 << 34
 """Largest binary file in bytes."""
 
@@ -76,7 +73,11 @@ class SparseModel:
 
 def is_model(folder: Path) -> bool:
     """Whether ``folder`` holds cameras and images of a model."""
-    return any(all((folder / f"{t}{end}").is_file() for t in _TABLES) for end in (".bin", ".txt"))
+    return any(_has_tables(folder, end) for end in (".bin", ".txt"))
+
+
+def _has_tables(folder: Path, end: str) -> bool:
+    return all((folder / f"{table}{end}").is_file() for table in _TABLES)
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -85,17 +86,16 @@ def read_model(folder: Path) -> SparseModel:
     Raises:
         InputError: a file is missing, cut off or of another format.
     """
-    binary = all((folder / f"{table}.bin").is_file() for table in _TABLES)
+    binary = _has_tables(folder, ".bin")
     path = folder
     try:
-        path = folder / ("cameras.bin" if binary else "cameras.txt")
-        cameras = dict(_binary_cameras(path) if binary else _text_cameras(path))
+        path = folder / f"cameras{'.bin' if binary else '.txt'}"
+        cameras = _by_number(_binary_cameras(path) if binary else _text_cameras(path))
         path = path.with_stem("images")
-        images = dict(_binary_images(path) if binary else _text_images(path))
+        images = _by_number(_binary_images(path) if binary else _text_images(path))
         path = path.with_stem("points3D")
-        points = None
-        if path.is_file():
-            points = _collected(_binary_points(path) if binary else _text_points(path))
+        rows = _binary_points(path) if binary else _text_points(path)
+        points = _collected(rows) if path.is_file() else None
     except (struct.error, ValueError, IndexError, ArithmeticError) as error:
         said = str(error)  # a number parser's message would quote the file
         why = f" ({said})" if isinstance(error, _WrongModel) else ""
@@ -106,7 +106,9 @@ def read_model(folder: Path) -> SparseModel:
 
 
 def _collected(points: Iterator[tuple[list[float], list[int]]]) -> SparsePoints:
-    positions, seen_point, seen_image = [], [], []
+    positions = []
+    seen_point = []
+    seen_image = []
     for index, (position, images) in enumerate(points):
         positions.append(position)
         seen_point += [index] * len(images)
@@ -118,40 +120,45 @@ def _collected(points: Iterator[tuple[list[float], list[int]]]) -> SparsePoints:
     )
 
 
-def _rows(path: Path) -> Iterator[list[str]]:
-    """The words of each line without comments; empty lines included, since they mean no points."""
-    for line in read_text(path).splitlines():
-        if not line.startswith("#"):
-            yield line.split()
+def _by_number(rows: Iterable[tuple[int, Row]]) -> dict[int, Row]:
+    found: dict[int, Row] = {}
+    for number, row in rows:
+        if found.setdefault(number, row) != row:
+            raise _WrongModel(f"two rows with the number {number}")
+    return found
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """The lines of a table without comments, and without empty ones, which mean no keypoints."""
+    lines = (line.strip() for line in read_text(path).split("\n"))
+    return (line for line in lines if line and line[0] != "#")
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
-    for words in _rows(path):
-        if words:
-            number, model, width, height, *parameters = words
-            values = tuple(float(word) for word in parameters)
-            if len(values) != dict(_MODELS).get(model, len(values)):
-                raise _WrongModel(f"{len(values)} parameters of a {model} camera")
-            yield int(number), ModelCamera(model, int(width), int(height), values)
+    for line in _lines(path):
+        number, model, width, height, *parameters = line.split()
+        values = tuple(float(word) for word in parameters)
+        if model in COLMAP_MODELS and len(values) != len(COLMAP_MODELS[model]):
+            raise _WrongModel(f"{len(values)} parameters of a {model} camera")
+        yield int(number), ModelCamera(model, int(width), int(height), values)
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    lines = iter([line for line in read_text(path).splitlines() if not line.startswith("#")])
-    for line in lines:
-        words = line.split(maxsplit=9)
-        if not words:
+    """Images by the rows that have a name; rows of keypoints, which scripts may leave out, are
+    triples of numbers."""
+    for line in _lines(path):
+        if _KEYPOINTS.fullmatch(line) and len(line.split()) % 3 == 0:
             continue
+        words = line.split(maxsplit=9)
         if len(words) != 10:
             raise _WrongModel(f"{len(words)} columns in the row of an image, not 10")
         w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
         yield int(words[0]), ModelImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
-        next(lines, None)  # its keypoints
 
 
 def _text_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
-    for words in _rows(path):
-        if words:
-            yield [float(word) for word in words[1:4]], [int(word) for word in words[8::2]]
+    for words in map(str.split, _lines(path)):
+        yield [float(word) for word in words[1:4]], [int(word) for word in words[8::2]]
 
 
 class _WrongModel(ValueError):
@@ -188,22 +195,15 @@ class _Bytes:
         if self._at > len(self._data):
             raise _WrongModel("end of file")
 
-    def array(self, count: int, columns: int) -> Int64[np.ndarray, "n k"]:
-        """``count`` rows of 32-bit numbers."""
-        start = self._at
-        self.skip(4 * count * columns)
-        values = np.frombuffer(self._data, "<u4", count * columns, start)
-        return values.reshape(count, columns).astype(np.int64)
-
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
     data = _Bytes(path)
     for _ in range(data.count()):
         number, model, width, height = data.take("IiQQ")
-        if not 0 <= model < len(_MODELS):
+        if not 0 <= model < len(COLMAP_MODELS):
             raise _WrongModel(f"camera model number {model} is unknown here")
-        name, parameters = _MODELS[model]
-        yield number, ModelCamera(name, width, height, data.take(f"{parameters}d"))
+        name, parameters = list(COLMAP_MODELS.items())[model]
+        yield number, ModelCamera(name, width, height, data.take(f"{len(parameters)}d"))
 
 
 def _binary_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
@@ -219,13 +219,39 @@ def _binary_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
     for _ in range(data.count()):
         _, x, y, z = data.take("Q3d")
         data.skip(3 + 8)  # colour and error
-        yield [x, y, z], data.array(data.count(), 2)[:, 0].tolist()
+        track = data.take(f"{2 * data.count()}I")
+        yield [x, y, z], list(track[::2])  # its images; the others are keypoints
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of the model in a project, or none."""
-    places = (folder / name for name in _MODEL_FOLDERS)
-    return next((place for place in places if is_model(place)), None)
+    """The folder of the model in a project, the one of most images; none where there is none."""
+    return next(iter(_models(folder)), None)
+
+
+def _models(folder: Path) -> dict[Path, int]:
+    """Folders of the models of a project, each with its number of images, the largest first; a
+    single one is not counted."""
+    for name in _MODEL_FOLDERS:
+        place = folder / name
+        own = [place] if is_model(place) else []
+        if own and not name:
+            return {place: 0}  # given itself
+        numbered = (p for p in place.glob("*") if p.name.isdecimal() and is_model(p))
+        places = [*sorted(numbered, key=lambda p: int(p.name)), *own]
+        if places:
+            counts = {p: _count(p) if len(places) > 1 else 0 for p in places}
+            return dict(sorted(counts.items(), key=lambda pair: -pair[1]))
+    return {}
+
+
+def _count(place: Path) -> int:
+    """Number of images of a model; 0 where it is damaged."""
+    try:
+        if _has_tables(place, ".bin"):
+            return _Bytes(place / "images.bin").count()
+        return sum(1 for _ in _text_images(place / "images.txt"))
+    except (InputError, struct.error, ValueError):
+        return 0
 
 
 def open_colmap(folder: Path, images: Path | None = None) -> PosedSet:
@@ -233,35 +259,49 @@ def open_colmap(folder: Path, images: Path | None = None) -> PosedSet:
 
     ``images`` is their folder; without it, they are searched for around the model.
     """
-    place = find_model(folder)
-    if place is None:
+    places = _models(folder)
+    if not places:
         raise InputError(f"{folder} holds no COLMAP model (cameras, images, points3D).")
-    place = place.resolve()
+    place = next(iter(places)).resolve()
     model = read_model(place)
     if not model.images:
         raise InputError(f"The COLMAP model {place} has no registered image.")
     numbers = sorted(model.images, key=lambda number: natural_key(model.images[number].name))
-    root = images or _image_folder(place, [model.images[number] for number in numbers])
+    names = [model.images[number].name for number in numbers]
+    root = images or _image_folder(place, names)
+    paths = NamedFiles(root).find(names)
     files = tuple(
-        _file(model, model.images[number], root, place, k) for k, number in enumerate(numbers)
+        _file(model, model.images[number], root, path, place, k)
+        for k, (number, path) in enumerate(zip(numbers, paths, strict=True))
     )
-    return PosedSet("colmap", _project(place).name, files, points=_points(model, numbers))
+    others = [f"{other} ({count} images)" for other, count in places.items()][1:]
+    said = (f"COLMAP models beside {place}: {named(others)}",) if others else ()
+    account = Account(left=said) + elsewhere(names, paths)
+    account += Account() if images else unlisted(paths)
+    points = _points(model, numbers)
+    return PosedSet("colmap", _project(place).name, files, points=points, account=account)
 
 
 def pose_of(image: ModelImage) -> Float64[np.ndarray, "4 4"]:
     """World to camera; NaN where the quaternion is zero."""
-    quaternion = np.array(image.quaternion, dtype=np.float64)
-    T_cw = np.eye(4)
-    T_cw[:3, 3] = image.translation
+    return pose_from(image.quaternion, image.translation)
+
+
+def pose_from(wxyz: Sequence[float], translation: Sequence[float]) -> Float64[np.ndarray, "4 4"]:
+    """The pose of a quaternion and a translation; NaN where the quaternion is zero."""
+    quaternion = np.array(wxyz, dtype=np.float64)
     norm = np.linalg.norm(quaternion)
+    T = np.eye(4)
     if not np.isfinite(norm) or norm == 0:
-        T_cw[:3] = np.nan
-    else:
-        T_cw[:3, :3] = quaternion_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
-    return T_cw
+        return np.full((4, 4), np.nan)
+    T[:3, :3] = quaternion_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
+    T[:3, 3] = translation
+    return T
 
 
-def _file(model: SparseModel, image: ModelImage, root: Path, place: Path, index: int) -> PosedFile:
+def _file(
+    model: SparseModel, image: ModelImage, root: Path, path: Path | None, place: Path, index: int
+) -> PosedFile:
     if image.camera not in model.cameras:
         raise InputError(
             f"{place}: image {image.name} names camera {image.camera}, which is not listed; is "
@@ -271,37 +311,32 @@ def _file(model: SparseModel, image: ModelImage, root: Path, place: Path, index:
     calibration = calibration_from_colmap(
         camera.model, camera.width, camera.height, camera.parameters, str(place)
     )
-    path = _image_path(root, image.name)
+    path = path or root / image.name
+    name = path.relative_to(root).as_posix() if path.is_relative_to(root) else image.name
     time = index / FRAMES_PER_SECOND
-    return PosedFile(path, pose_of(image), calibration, mask_beside(root, image.name), time)
+    mask = mask_beside(root, name)
+    return of_stored_pixels(PosedFile(path, pose_of(image), calibration, mask, time))
 
 
 def _project(place: Path) -> Path:
     """The folder of the project that a model folder belongs to."""
-    while place.name in _PROJECT_FOLDERS and place.parent != place:
-        place = place.parent
-    return place
+    above = (p for p in (place, *place.parents) if not _PROJECT_FOLDERS.fullmatch(p.name))
+    return next(above, place)
 
 
-def _image_folder(place: Path, images: list[ModelImage]) -> Path:
+def _image_folder(place: Path, names: list[str]) -> Path:
     """Folder of the images: the known one that has most of a sample of them."""
     project = _project(place)
     bases = dict.fromkeys((project, project / "iphone", place, place.parent, place.parent.parent))
-    roots = [base / name for base in bases for name in _IMAGE_FOLDERS]
-    sample = images[:: max(1, len(images) // 10)]
-    found = [sum(_image_path(root, image.name).is_file() for image in sample) for root in roots]
+    roots = [base / name for base in bases for name in (*IMAGE_FOLDERS, "")]
+    sample = names[:: max(1, len(names) // 10)]
+    found = [sum(path is not None for path in NamedFiles(root).find(sample)) for root in roots]
     if not any(found):
         raise InputError(
-            f"The images of the COLMAP model {place}, such as {images[0].name}, are not in "
+            f"The images of the COLMAP model {place}, such as {names[0]}, are not in "
             f"{project / 'images'}; put them there."
         )
     return roots[found.index(max(found))]
-
-
-def _image_path(root: Path, name: str) -> Path:
-    """The file of an image; ScanNet++ puts ``video/`` before some names."""
-    path, short = root / name, root / name.rsplit("/", 1)[-1]
-    return short if short.is_file() and not path.is_file() else path
 
 
 def mask_beside(root: Path, name: str) -> Path | None:
@@ -311,11 +346,9 @@ def mask_beside(root: Path, name: str) -> Path | None:
     """
     if not Path(name).name:
         return None
-    for folder in ("masks", "mask", "rgb_masks"):
-        for file in (f"{name}.png", str(Path(name).with_suffix(".png"))):
-            if (root.parent / folder / file).is_file():
-                return root.parent / folder / file
-    return None
+    files = (f"{name}.png", Path(name).with_suffix(".png"))
+    folders = ("masks", "mask", "rgb_masks")
+    return first_file(root.parent / folder / file for folder in folders for file in files)
 
 
 def _points(model: SparseModel, numbers: list[int]) -> SparsePoints | None:

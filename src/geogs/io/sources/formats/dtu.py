@@ -66,7 +66,8 @@ def decompose(
     P = P * np.sign(np.linalg.det(P[:, :3]))
     K, R = cv2.RQDecomp3x3(P[:, :3])[1:3]
     signs = np.sign(np.diag(K))
-    K, R = K * signs, signs[:, None] * R
+    K = K * signs
+    R = signs[:, None] * R
     T_cw[:3, :3] = R
     try:
         T_cw[:3, 3] = np.linalg.solve(K, P[:, 3])
@@ -118,9 +119,12 @@ def _calibration(K: Float64[np.ndarray, "3 3"], folder: Path) -> Calibration:
             f"is not supported; is the order of the matrix right?"
         )
     return Calibration(
-        float(K[0, 0]), float(K[1, 1]), float(K[0, 2]) - 0.5, float(K[1, 2]) - 0.5,
+        float(K[0, 0]),
+        float(K[1, 1]),
+        float(K[0, 2]) - 0.5,
+        float(K[1, 2]) - 0.5,
         origin=str(_cameras(folder)),
-    )  # fmt: skip
+    )
 
 
 def _pictures(folder: Path, names: tuple[str, ...]) -> list[Path]:

@@ -17,7 +17,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there, finite, listed
 from geogs.io.sources.formats.timed_poses import with_timed_poses
-from geogs.io.sources.formats.tum import PER_METRE, known_camera
+from geogs.io.sources.formats.tum import UNIT, known_camera
 from geogs.io.sources.known_intrinsics import find_calibration
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory
@@ -26,7 +26,7 @@ LISTING = "associations.txt"
 _TRUTH = "*.gt.freiburg"
 _CAMERA = Calibration(
     481.2, 480.0, 319.5, 239.5, width=640, height=480, origin="the ICL-NUIM data set"
-)  # fmt: skip
+)
 _NAMES = ("frei_png", "living_room", "livingroom", "office_room", "icl-nuim", "icl_nuim")
 """Parts of the names of folders that have the data set's camera."""
 _Y_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -88,4 +88,4 @@ def _row(folder: Path, words: list[str]) -> ImageFile:
     first, second = finite(one), finite(other)
     is_depth_first = "depth" in Path(a).parts
     time, image, depth = (second, b, a) if is_depth_first else (first, a, b)
-    return ImageFile(folder / image, time, DepthFile(folder / depth, PER_METRE))
+    return ImageFile(folder / image, time, DepthFile(folder / depth, UNIT))

@@ -29,7 +29,8 @@ _FRAMES_PER_SECOND = 10.0
 def open_kitti_odometry(place: Place) -> ImageList:
     """Read the images of one camera; times are those of ``times.txt``."""
     number = int(place.pictures.name[-1])
-    listing, calib = place.folder / "times.txt", place.folder / "calib.txt"
+    listing = place.folder / "times.txt"
+    calib = place.folder / "calib.txt"
     times = _seconds(listing) if listing.is_file() else None
     camera = camera_of(calib, number) if calib.is_file() else None
     name = f"{place.folder.resolve().name}-{place.pictures.name}"

@@ -76,7 +76,9 @@ def _imu_trajectory(oxts: Path) -> Trajectory:
     if len(names) != len(times):
         raise InputError(f"{oxts} holds {len(names)} rows for {len(times)} times; copy it again.")
     rows = np.array([_six(oxts / "data" / name) for name in names]).reshape(-1, 6)
-    latitude, longitude, altitude = np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]
+    latitude = np.radians(rows[:, 0])
+    longitude = np.radians(rows[:, 1])
+    altitude = rows[:, 2]
     scale = np.cos(latitude[0]) * _EARTH if len(rows) else _EARTH
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, 0, 3] = scale * longitude
@@ -114,7 +116,8 @@ def _rows(folder: Path, name: str) -> tuple[dict[str, list[float]], Path]:
 def _motion(R: list[float], t: list[float], file: Path) -> Float64[np.ndarray, "4 4"]:
     T = np.eye(4)
     if len(R) == 9 and len(t) == 3:
-        T[:3, :3], T[:3, 3] = np.reshape(R, (3, 3)), t
+        T[:3, :3] = np.reshape(R, (3, 3))
+        T[:3, 3] = t
     if len(R) != 9 or len(t) != 3 or not is_rigid(T[None])[0]:
         raise InputError(f"{file} holds no rotation with its translation; copy it again.")
     return T

@@ -25,6 +25,7 @@ from geogs.io.sources.formats.image_files import (
     images_in,
     in_order_of_time,
 )
+from geogs.io.sources.named_files import root_above
 from geogs.io.sources.posed.posed_set import PosedSet
 
 _MODELS = {
@@ -44,14 +45,9 @@ _FRAME = re.compile(r"frame_(\d{1,9})\.\w+")
 
 def place_of_model(folder: Path) -> Place | None:
     """Images of the model in ``folder``; none where it is not the model of such a scene."""
-    folder = folder.absolute()
-    for pictures, model in _MODELS.items():
-        parts = Path(model).parts
-        if folder.parts[-len(parts) :] == parts:
-            root = folder.parents[len(parts) - 1]
-            if has_images(root / pictures):
-                return Place(root, root / pictures)
-    return None
+    roots = ((root_above(folder, Path(model)), name) for name, model in _MODELS.items())
+    places = (Place(root, root / name) for root, name in roots if root)
+    return next((place for place in places if has_images(place.pictures)), None)
 
 
 def open_photographs(place: Place) -> ImageList:

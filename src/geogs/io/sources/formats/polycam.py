@@ -38,7 +38,8 @@ def open_polycam(folder: Path) -> ImageList:
     places = polycam_folders(folder)
     assert places is not None, "the folder is an export"
     cameras, images = places
-    files, lenses = [], []
+    files = []
+    lenses = []
     paths = sorted(cameras.glob("*.json"), key=lambda p: natural_key(p.name))
     times = _times([path.stem for path in paths])
     for path in paths:

@@ -144,14 +144,24 @@ class Record3dRecording:
             raise InputError(f"{path}: its metadata cannot be understood; copy it again.") from None
         if not (0 < fps < 1e4):
             raise InputError(f"{path}: its metadata says {fps} frames a second.")
-        depths, fault = sum(name.endswith(".depth") for name in names), ""
+        depths = sum(name.endswith(".depth") for name in names)
+        fault = ""
         if depths and _lzfse() is None:
-            depths, fault = 0, "Record3D's depth needs pip install 'geogs[record3d]'"
+            depths = 0
+            fault = "Record3D's depth needs pip install 'geogs[record3d]'"
         self.info = RecordingInfo(
-            "record3d", path.resolve().stem, width, height, fps, len(self._images), calibration,
-            depths=depths, depth_fault=fault,
-            has_poses=bool(self._poses), is_capture=True,
-        )  # fmt: skip
+            "record3d",
+            path.resolve().stem,
+            width,
+            height,
+            fps,
+            len(self._images),
+            calibration,
+            depths=depths,
+            depth_fault=fault,
+            has_poses=bool(self._poses),
+            is_capture=True,
+        )
 
     @property
     def paths(self) -> Sequence[Path]:
@@ -162,7 +172,8 @@ class Record3dRecording:
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read frames ``start, start + stride, ...`` before ``stop``."""
-        info, has_times = self.info, len(self._times) == len(self._images)
+        info = self.info
+        has_times = len(self._times) == len(self._images)
         for n, number in list(enumerate(self._images))[start:stop:stride]:
             depth = Record3dDepth(self._files, number, self._size) if info.has_depth else None
             seconds = self._times[n] if has_times else n / info.fps

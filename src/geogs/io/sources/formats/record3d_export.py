@@ -36,7 +36,8 @@ def open_record3d_export(folder: Path) -> ImageList:
     said = read_json(folder / METADATA)
     try:
         fps = float(said.get("fps") or FRAMES_PER_SECOND)
-        calibration, poses = record3d_camera(said), measured_poses(said["poses"])
+        calibration = record3d_camera(said)
+        poses = measured_poses(said["poses"])
         times = [float(t) for t in said.get("frameTimestamps") or []]
         if not 0 < fps < 1e4:
             raise ValueError(f"{fps} frames a second")
@@ -52,9 +53,14 @@ def open_record3d_export(folder: Path) -> ImageList:
     has_depth = next((folder / "depth").glob("*.exr"), None) is not None
     fault = "depth in EXR is not read; Record3D's .r3d of the same recording has it, too"
     return ImageList(
-        "record3d", _name(folder), files, calibration, bool(poses),
-        is_capture=True, depth_fault=fault if has_depth else "",
-    )  # fmt: skip
+        "record3d",
+        _name(folder),
+        files,
+        calibration,
+        bool(poses),
+        is_capture=True,
+        depth_fault=fault if has_depth else "",
+    )
 
 
 def _name(folder: Path) -> str:

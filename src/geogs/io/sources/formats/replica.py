@@ -11,20 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import first_file, numbered, read_json
+from geogs.documents import first_file, numbered
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, read_replica_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
-from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.depth_files import DepthFile, DepthUnit
+from geogs.io.sources.depth_unit import camera_scale
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, file_names
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 
 _NAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
 _CAMERA = Calibration(
     600.0, 600.0, 599.5, 339.5, width=1200, height=680, origin="the Replica data set"
-)  # fmt: skip
-_PER_METRE = 6553.5
+)
+_UNIT = DepthUnit(6553.5, "Replica's")
 
 
 def is_replica(folder: Path) -> bool:
@@ -37,9 +38,11 @@ def open_replica(folder: Path) -> ImageList:
     """Read a scene; frame k is at k / 30 s, which matches line k of ``traj.txt``."""
     results = _results(folder)
     scene = results.parent.resolve()
-    per_metre, there = _units_per_metre(scene), {*file_names(results)}
+    file = _parameters(scene)
+    unit = (file and camera_scale(file)) or _UNIT
+    there = {*file_names(results)}
     files = [
-        ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, per_metre, there))
+        ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, unit, there))
         for k, path in numbered(results.iterdir(), _NAME)
     ]
     reader = ImageList("replica", scene.name, files, None)
@@ -49,21 +52,10 @@ def open_replica(folder: Path) -> ImageList:
     return reader
 
 
-def _depth(image: Path, number: int, per_metre: float, there: Container[str]) -> DepthFile | None:
+def _depth(image: Path, number: int, unit: DepthUnit, there: Container[str]) -> DepthFile | None:
     digits = len(image.stem) - len("frame")
     path = image.with_name(f"depth{number:0{digits}d}.png")
-    return DepthFile(path, per_metre) if path.name in there else None
-
-
-def _units_per_metre(scene: Path) -> float:
-    """Depth units per metre of ``cam_params.json``, or else of the data set."""
-    file = _parameters(scene)
-    document = None if file is None else read_json(file)
-    camera = document.get("camera") if isinstance(document, dict) else None
-    scale = camera.get("scale", _PER_METRE) if isinstance(camera, dict) else _PER_METRE
-    if type(scale) not in (int, float) or not 0 < scale < 1e9:
-        raise InputError(f"{file}: the scale of the depths is no number above 0; correct it.")
-    return float(scale)
+    return DepthFile(path, unit) if path.name in there else None
 
 
 def _parameters(scene: Path) -> Path | None:
@@ -74,7 +66,8 @@ def _parameters(scene: Path) -> Path | None:
 def open_posed_replica(folder: Path) -> PosedSet:
     """Read a scene; images without a valid pose are left out."""
     poses = _results(folder).parent / "traj.txt"
-    reader, trajectory = open_replica(folder), read_replica_trajectory(poses)
+    reader = open_replica(folder)
+    trajectory = read_replica_trajectory(poses)
     frames = np.rint(trajectory.timestamps * FRAMES_PER_SECOND).astype(int)
     T_cw = {int(k): np.linalg.inv(T) for k, T in zip(frames, trajectory.T_wc, strict=True)}
     files = []

@@ -23,9 +23,15 @@ from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 _NAME = re.compile(r"frame-(\d+)\.color\.(png|jpg|jpeg)", re.IGNORECASE)
 # The Kinect's nominal colour camera; the data set publishes no calibration of its own for colour.
 _CAMERA = Calibration(
-    525.0, 525.0, 320.0, 240.0, width=640, height=480,
-    origin="the 7-Scenes colour camera, nominal", is_nominal=True,
-)  # fmt: skip
+    525.0,
+    525.0,
+    320.0,
+    240.0,
+    width=640,
+    height=480,
+    origin="the 7-Scenes colour camera, nominal",
+    is_nominal=True,
+)
 COLOUR_FROM_DEPTH = (-0.025, 0.0, 0.0)
 """Metres: X_colour = X_depth + this. Both cameras of the Kinect look the same way, side by side;
 the data set neither registers depth to colour nor publishes their positions."""

@@ -13,7 +13,7 @@ from geogs.documents import numbered, read_text
 from geogs.errors import InputError
 from geogs.io.pose_files import poses_from
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.depth_files import PHONE, DepthFile
 from geogs.io.sources.formats.video_file import VideoFile
 from geogs.io.sources.pose_priors import rigid_pose
 from geogs.io.sources.reader import RawFrame
@@ -39,7 +39,8 @@ class StrayRecording(VideoFile):
         turns = self.info.quarter_turns
         depths = numbered((folder / "depth").glob("*.png"))
         self._depths = {number: _depth(folder, path, turns) for number, path in depths}
-        matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
+        matrix = folder / "camera_matrix.csv"
+        odometry = folder / "odometry.csv"
         stored = (self.info.width, self.info.height)[:: -1 if turns % 2 else 1]
         self._poses = _poses(odometry, turns) if odometry.is_file() else {}
         self.info = replace(
@@ -48,6 +49,7 @@ class StrayRecording(VideoFile):
             name=folder.resolve().name,
             calibration=_calibration(matrix, *stored) if matrix.is_file() else None,
             depths=len(self._depths),
+            depth_sample=tuple(self._depths.values()),
             has_poses=bool(self._poses),
             is_capture=True,
         )
@@ -62,7 +64,7 @@ class StrayRecording(VideoFile):
 def _depth(folder: Path, path: Path, quarter_turns: int) -> DepthFile:
     confidence = folder / "confidence" / path.name
     known = confidence if confidence.is_file() else None
-    return DepthFile(path, confidence=known, quarter_turns=quarter_turns)
+    return DepthFile(path, PHONE, confidence=known, quarter_turns=quarter_turns)
 
 
 def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:

@@ -22,9 +22,10 @@ from geogs.types import Trajectory
 
 _SIDES = ("front", "back", "left", "right", "top", "bottom")
 PICTURES = (
-    "image_left", "image_right",
+    "image_left",
+    "image_right",
     *(f"image_{eye}cam_{side}" for side in _SIDES for eye in "lr"),
-)  # fmt: skip
+)
 """Folders of images, one for each camera."""
 _OPENCV_FROM_NED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _NAME = re.compile(r"([0-9]{1,12})_\w+\.\w+")
@@ -40,9 +41,14 @@ def open_tartanair(place: Place) -> ImageList:
     images = ImageList("tartanair", name, files, None)
     width, height = images.info.width, images.info.height
     calibration = Calibration(
-        width / 2, width / 2, (width - 1) / 2, (height - 1) / 2,
-        width=width, height=height, origin="the TartanAir data set",
-    )  # fmt: skip
+        width / 2,
+        width / 2,
+        (width - 1) / 2,
+        (height - 1) / 2,
+        width=width,
+        height=height,
+        origin="the TartanAir data set",
+    )
     images.info = replace(images.info, calibration=calibration)
     return images
 

@@ -1,7 +1,5 @@
 """Images with poses that were measured at other times."""
 
-import logging
-
 import numpy as np
 from jaxtyping import Bool, Float64
 
@@ -14,8 +12,6 @@ MAX_GAP = 0.1
 """Longest gap between two measured poses for interpolation, in seconds."""
 MAX_BEYOND = 0.02
 """Longest time of an image before the first or after the last measured pose, in seconds."""
-
-_log = logging.getLogger(__name__)
 
 
 def with_timed_poses(
@@ -39,17 +35,16 @@ def with_timed_poses(
             f"No image of {info.name} has a pose: the times of its images and of its true poses do "
             f"not overlap; are they of one sequence?"
         )
-    if not known.all():
-        _log.warning(
-            "%s: left out %d of %d images, at whose time no pose was measured.",
-            info.name, int((~known).sum()), len(known),
-        )  # fmt: skip
     files = tuple(
         PosedFile(file.path, np.linalg.inv(T), info.calibration, None, file.timestamp)
         for file, T, is_known in zip(images.files, T_wc, known, strict=True)
         if is_known
     )
-    return PosedSet(info.kind, info.name, files, scene_scale="metres")
+    posed = PosedSet(info.kind, info.name, files, scene_scale="metres", account=info.account)
+    if known.all():
+        return posed
+    count = f"{int((~known).sum())} of {len(known)} images"
+    return posed.left(f"{count}, at whose time no pose was measured")
 
 
 def poses_at(

@@ -11,7 +11,7 @@ import numpy as np
 
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.depth_files import DepthFile, DepthUnit
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there, finite, listed
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.known_intrinsics import find_calibration
@@ -20,27 +20,42 @@ from geogs.io.sources.posed.posed_set import PosedSet
 # Published calibrations of the colour cameras (Sturm et al., "A benchmark for the evaluation of
 # RGB-D SLAM systems", IROS 2012); the images of Freiburg 3 are already undistorted.
 _FREIBURG_1 = Calibration(
-    517.306408, 516.469215, 318.643040, 255.313989,
+    517.306408,
+    516.469215,
+    318.643040,
+    255.313989,
     distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
-    width=640, height=480, origin="the TUM RGB-D data set, Freiburg 1",
-)  # fmt: skip
+    width=640,
+    height=480,
+    origin="the TUM RGB-D data set, Freiburg 1",
+)
 _FREIBURG_2 = Calibration(
-    520.908620, 521.007327, 325.141442, 249.701764,
+    520.908620,
+    521.007327,
+    325.141442,
+    249.701764,
     distortion=(0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
-    width=640, height=480, origin="the TUM RGB-D data set, Freiburg 2",
-)  # fmt: skip
+    width=640,
+    height=480,
+    origin="the TUM RGB-D data set, Freiburg 2",
+)
 _FREIBURG_3 = Calibration(
     535.4, 539.2, 320.1, 247.6, width=640, height=480, origin="the TUM RGB-D data set, Freiburg 3"
-)  # fmt: skip
+)
 
 _BONN = Calibration(
-    542.822841, 542.576870, 315.593520, 237.756098,
+    542.822841,
+    542.576870,
+    315.593520,
+    237.756098,
     distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
-    width=640, height=480, origin="the Bonn RGB-D dynamic data set",
-)  # fmt: skip
+    width=640,
+    height=480,
+    origin="the Bonn RGB-D dynamic data set",
+)
 
-PER_METRE = 5000.0
-"""Units of depth images per metre."""
+UNIT = DepthUnit(5000.0, "TUM's")
+"""Unit of depth images where no file beside them states another."""
 ASSOCIATED = 0.02
 """Largest time difference between an image and its depth, in seconds."""
 
@@ -78,7 +93,7 @@ def _with_depths(folder: Path, files: list[ImageFile]) -> tuple[list[ImageFile],
     for file in files:
         n = int(np.abs(times - file.timestamp).argmin())
         is_near = abs(times[n] - file.timestamp) <= ASSOCIATED
-        found.append(replace(file, depth=DepthFile(depths[n].path, PER_METRE) if is_near else None))
+        found.append(replace(file, depth=DepthFile(depths[n].path, UNIT) if is_near else None))
     if not any(file.depth is not None for file in found):
         return found, f"no time in {listing} is near that of an image"
     return depths_there(found, listing)

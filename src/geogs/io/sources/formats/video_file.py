@@ -3,6 +3,7 @@
 import itertools
 import logging
 import math
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,43 +15,53 @@ from jaxtyping import UInt8
 
 from geogs.documents import require_file
 from geogs.errors import InputError
+from geogs.io.sources.account import Account
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 
 # FFmpeg also "plays" text, pictures, devices, and play lists, which open the files they name
 # before they can be checked; none of them is a video file.
-_NOT_VIDEO = frozenset({
-    "tty", "image2", "image2pipe", "hls", "concat", "concatf", "dash", "webm_dash_manifest", "sdp",
-    "rtp", "rtsp", "sap", "imf", "vobsub", "lrc", "srt", "lavfi", "avisynth", "vapoursynth", "alsa",
-    "oss", "fbdev", "kmsgrab", "x11grab", "xcbgrab", "video4linux2,v4l2",
-})  # fmt: skip
-
+_NOT_VIDEO = (
+    "tty image2 image2pipe hls concat concatf dash webm_dash_manifest sdp rtp rtsp sap imf vobsub "
+    "lrc srt lavfi avisynth vapoursynth alsa oss fbdev kmsgrab x11grab xcbgrab video4linux2,v4l2"
+)
 _OPTIONS = {
     "protocol_whitelist": "file",  # no container may lead to the network
-    "format_whitelist": ",".join(sorted(av.formats_available - _NOT_VIDEO)),
+    "format_whitelist": ",".join(sorted(av.formats_available.difference(_NOT_VIDEO.split()))),
 }
 
 _log = logging.getLogger(__name__)
 
+MOST_ASPECT = 4.0
+"""Largest ratio of the sides of a pixel that is believed."""
+
 
 class VideoFile:
-    """Reader of one video; frames are rotated upright by the container's display matrix."""
+    """Reader of one video; frames are shown as the container's display matrix says."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         with _open(path) as container:
             stream = container.streams.video[0]
-            length, seconds = stream.frames or None, _seconds(container)
-            fps = float(stream.average_rate or stream.guessed_rate or 30)
-            first = next((frame for frame in _decoded(container, path) if frame), None)
+            first = next(filter(None, _decoded(container, path)), None)
             if first is None:
                 raise InputError(
                     f"{path} holds no picture that can be decoded; is it complete and a video?"
                 )
-            turns = clockwise_quarter_turns(float(first.rotation))
+            self._is_mirrored, turns = display_turn(first)
+            aspect = _pixel_aspect(stream, turns)
             width, height = (first.width, first.height)[:: -1 if turns % 2 else 1]
-        self.info = RecordingInfo(
-            "video", path.name, width, height, fps, length, quarter_turns=turns, seconds=seconds
-        )
+            self.info = RecordingInfo(
+                "video",
+                path.name,
+                width,
+                height,
+                fps=float(stream.average_rate or stream.guessed_rate or 30),
+                length=stream.frames or None,
+                quarter_turns=turns,
+                seconds=_seconds(container),
+                pixel_aspect=aspect,
+                account=_account(self._is_mirrored, aspect),
+            )
 
     @property
     def paths(self) -> list[Path]:
@@ -64,21 +75,17 @@ class VideoFile:
             for index, frame in enumerate(_decoded(container, self._path)):
                 if stop is not None and index >= stop:
                     return
-                is_wanted = index >= start and (index - start) % stride == 0
-                label = f"{self.info.name}, frame {index}"
-                if frame is not None:
-                    last = self._time(frame, last)
-                    if is_wanted:
-                        image = frame.to_ndarray(format="rgb24")
-                        upright = turn_upright(image, self.info.quarter_turns)
-                        yield RawFrame(label, last, upright, name=str(index))
-                elif is_wanted:
-                    yield RawFrame(label, last or 0.0, None)
+                last = last if frame is None else self._time(frame, last)
+                if index >= start and (index - start) % stride == 0:
+                    label = f"{self.info.name}, frame {index}"
+                    image = None if frame is None else self._shown(frame)
+                    yield RawFrame(label, last or 0.0, image, name=str(index))
 
     def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
         """Read the images where decoding of these frames starts; fewer where it cannot seek."""
         with _open(self._path) as container:
-            stream, before = container.streams.video[0], -1
+            stream = container.streams.video[0]
+            before = -1
             first = stream.start_time or 0
             for start in starts:
                 try:
@@ -90,8 +97,13 @@ class VideoFile:
                 if frame is None or frame.pts is None or frame.pts == before:
                     continue
                 before = frame.pts
-                image = turn_upright(frame.to_ndarray(format="rgb24"), self.info.quarter_turns)
-                yield RawFrame(f"{self.info.name}, near frame {start}", frame.time or 0.0, image)
+                near = f"{self.info.name}, near frame {start}"
+                yield RawFrame(near, frame.time or 0.0, self._shown(frame))
+
+    def _shown(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """The image as a player shows it."""
+        image = frame.to_ndarray(format="rgb24")
+        return turn_upright(image[:, ::-1] if self._is_mirrored else image, self.info.quarter_turns)
 
     def _time(self, frame: av.VideoFrame, last: float | None) -> float:
         """Presentation time, or an estimate where it is missing or does not increase."""
@@ -100,13 +112,38 @@ class VideoFile:
         return 0.0 if last is None else last + 1 / self.info.fps
 
 
-def clockwise_quarter_turns(rotation: float) -> int:
-    """Quarter turns to the right that bring a frame upright.
+def display_turn(frame: av.VideoFrame) -> tuple[bool, int]:
+    """Whether a frame is to be mirrored left to right, and then its clockwise quarter turns.
 
-    Args:
-        rotation: counter-clockwise angle of the display matrix in degrees, as FFmpeg gives it.
+    Its display matrix takes a stored position (x, y) to (a x + c y, b x + d y), y down.
     """
-    return round(-rotation / 90) % 4
+    matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return False, 0
+    a, b, _, c, d = struct.unpack_from("=5i", bytes(matrix))
+    is_mirrored = a * d - b * c < 0
+    sign = -1 if is_mirrored else 1
+    angle = math.atan2(sign * b, sign * a)
+    return is_mirrored, round(angle / (math.pi / 2)) % 4
+
+
+def _pixel_aspect(stream: Any, quarter_turns: int) -> float:
+    """Width by height of a pixel of the upright images; 1 where the container does not say."""
+    said = stream.sample_aspect_ratio
+    stored = float(said) if said else 1.0
+    if not 1 / MOST_ASPECT <= stored <= MOST_ASPECT:
+        return 1.0
+    return 1 / stored if quarter_turns % 2 else stored
+
+
+def _account(is_mirrored: bool, pixel_aspect: float) -> Account:
+    """Sentences on the container's display matrix and the shape of pixels."""
+    said = []
+    if pixel_aspect != 1:
+        said.append(f"pixels are {pixel_aspect:.4g} times as wide as high, by the video file")
+    if is_mirrored:
+        said.append("images are mirrored, as a player shows them, by the video file")
+    return Account(tuple(said))
 
 
 def turn_upright(
@@ -153,7 +190,9 @@ def _decoded(container: InputContainer, path: Path) -> Iterator[av.VideoFrame | 
     """Decode to the end or to where the file is cut off; none stands for a damaged packet."""
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
-    count, shown, latest = 0, -math.inf, -math.inf
+    count = 0
+    shown = -math.inf
+    latest = -math.inf
     for packet in _packets(container, path):
         if packet.pts is not None and not packet.is_discard:
             latest = max(latest, packet.pts)

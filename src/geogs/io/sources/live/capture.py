@@ -33,7 +33,9 @@ class Capture:
 
     def frames(self) -> Generator[RawFrame, None, None]:
         """Images from now on, with their time of arrival in seconds since the start."""
-        capture, missed, number = self._open(), 0, 0
+        capture = self._open()
+        missed = 0
+        number = 0
         began = time.monotonic()
         try:
             while missed < MOST_MISSED:
@@ -42,7 +44,8 @@ class Capture:
                     missed += 1
                     time.sleep(1 / self.info.fps)
                     continue
-                missed, now = 0, time.monotonic() - began
+                missed = 0
+                now = time.monotonic() - began
                 rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                 yield RawFrame(f"{self.info.name}, frame {number}", now, rgb)
                 number += 1

@@ -39,7 +39,14 @@ class Played:
         self._reader = reader
         said = reader.info
         self.info = RecordingInfo(
-            "play", name, said.width, said.height, said.fps, calibration=said.calibration
+            "play",
+            name,
+            said.width,
+            said.height,
+            said.fps,
+            calibration=said.calibration,
+            pixel_aspect=said.pixel_aspect,
+            account=said.account,
         )
 
     def frames(self) -> Generator[RawFrame, None, None]:

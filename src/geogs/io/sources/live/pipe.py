@@ -132,7 +132,8 @@ class Pipe:
 
 def rgb(form: RawFormat, data: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """The picture of a frame's bytes."""
-    flat, size = np.frombuffer(data, np.uint8), (form.height, form.width)
+    flat = np.frombuffer(data, np.uint8)
+    size = (form.height, form.width)
     if form.pixels == "rgb24":
         return flat.reshape(*size, 3).copy()
     if form.pixels == "bgr24":
@@ -147,5 +148,7 @@ def rgb(form: RawFormat, data: bytes) -> UInt8[np.ndarray, "h w 3"]:
         halves = rest.reshape(2, (form.height + 1) // 2, (form.width + 1) // 2)
         cb, cr = (np.repeat(np.repeat(c, 2, 0), 2, 1)[: size[0], : size[1]] for c in halves)
     if not form.is_full_range:
-        y, cb, cr = _FULL_Y[y], _FULL_C[cb], _FULL_C[cr]
+        y = _FULL_Y[y]
+        cb = _FULL_C[cb]
+        cr = _FULL_C[cr]
     return cv2.cvtColor(np.dstack([y, cr, cb]), cv2.COLOR_YCrCb2RGB)

@@ -45,6 +45,7 @@ def _quaternion_order(T_cw: Poses) -> Poses:
     return np.linalg.inv(T_wc)
 
 
+_MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 _OPENGL = _turned_camera([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
 
 
@@ -84,6 +85,19 @@ _TURNED = (
         "poses of a body that looks along +x with z up",
         "put the columns -y, -z, x of the camera-to-world rotations for x, y, z",
         _turned_camera([[0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    ),
+    Convention(
+        "poses of mirrored images",
+        "flip the images, left and right",
+        lambda T: _MIRROR @ T @ _MIRROR,
+    ),
+    Convention(
+        "poses of the next image each", "move the poses by one row", lambda T: np.roll(T, 1, axis=0)
+    ),
+    Convention(
+        "poses of the image before each",
+        "move the poses by one row",
+        lambda T: np.roll(T, -1, axis=0),
     ),
     Convention(
         "quaternions in the order w x y z", "move the w column to the end", _quaternion_order

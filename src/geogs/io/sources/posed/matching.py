@@ -70,7 +70,8 @@ class Matcher:
             pair = self.match(first, second) if second >= 0 else None
             if pair is None:
                 break
-            self._offset, best = k, pair
+            self._offset = k
+            best = pair
             motion = self._motion(pair)
             if motion > MAX_MOTION:
                 self._offset = max(0, k - 1)

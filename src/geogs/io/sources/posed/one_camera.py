@@ -1,6 +1,5 @@
 """Images of several cameras, resampled to one common pinhole camera."""
 
-import logging
 from collections import Counter
 from collections.abc import Hashable, Sequence
 
@@ -13,13 +12,13 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
+from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.posed.posed_set import PosedFile
 from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
+from geogs.io.sources.tones import tones_of_files
 from geogs.io.sources.undistort import Rectifier, mask_as_image, resized_to
-
-_log = logging.getLogger(__name__)
 
 SAME_CAMERA = 0.02
 """Largest difference of two cameras that count as one, in pixels of the working image."""
@@ -37,6 +36,7 @@ class OneCamera:
     def __init__(self, files: Sequence[PosedFile], config: InputConfig) -> None:
         self._files = files
         self._sizes = [_size(file) for file in files]
+        self._tones = tones_of_files([file.path for file in files])
         keys = [(file.calibration, size) for file, size in zip(files, self._sizes, strict=True)]
         cameras = {
             (known, size): resolve_intrinsics(config.intrinsics, known, *size)
@@ -47,8 +47,8 @@ class OneCamera:
         rectifier = Rectifier(first, config.long_edge, config.field_of_view)
         self.camera: Camera = rectifier.camera
         """The pinhole camera of every image."""
-        self.origin = first.origin
-        """Origin of its intrinsics."""
+        self.calibration = first
+        """The calibration of most images as stored."""
         keeps_maps = len(cameras) <= MAX_KEPT_MAPS
         ways = {
             key: rectifier
@@ -58,30 +58,19 @@ class OneCamera:
         }
         self._ways = [ways[key] for key in keys]
 
-    def unlike(self) -> list[int]:
-        """Indices of the images whose cameras differ too much from the common one."""
+    def unlike(self) -> dict[int, str]:
+        """Images whose cameras differ too much from the common one, with a description of these."""
         ways = enumerate(self._ways)
-        return [k for k, way in ways if isinstance(way, Resampler) and way.is_unlike]
+        return {k: w.description for k, w in ways if isinstance(w, Resampler) and w.is_unlike}
 
-    def check(self) -> None:
-        """Raise InputError where cameras differ too much; warn where images are cropped."""
-        cropped = 0
-        for file, way in zip(self._files, self._ways, strict=True):
-            if isinstance(way, Rectifier):
-                continue
-            if way.is_unlike:
-                raise InputError(
-                    f"{file.path} ({way.description}) was taken with quite another camera than "
-                    f"{self._files[self._common].path}; give images of one camera, or undistort "
-                    "and crop them to one."
-                )
-            cropped += way.shared < 0.9
-        if cropped:
-            _log.warning(
-                "%d of %d images are from other cameras than most; what only they see at "
-                "their edges is not used.",
-                cropped, len(self._files),
-            )  # fmt: skip
+    @property
+    def account(self) -> Account:
+        """The camera, and what is lost of images by others."""
+        cropped = sum(isinstance(way, Resampler) and way.shared < 0.9 for way in self._ways)
+        of = f"{cropped} of {len(self._files)} images by other cameras"
+        left = (f"the edges of {of}, which only they see",) if cropped else ()
+        camera = Account((self.calibration.sentence,), left)
+        return camera + self._tones.account + self.calibration.account
 
     def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
         """Read image ``index`` in the common camera, and its mask, or none where all is valid.
@@ -89,8 +78,10 @@ class OneCamera:
         Raises:
             InputError: it cannot be read.
         """
-        file, stored, way = self._files[index], self._sizes[index], self._ways[index]
-        image = way(read_picture(file.path, stored, way.size))
+        file = self._files[index]
+        stored = self._sizes[index]
+        way = self._ways[index]
+        image = way(read_picture(file.path, stored, way.size, self._tones))
         mask = None
         if file.mask is not None:
             valid = read_mask(file.mask, stored[::-1], of_alpha=file.mask == file.path)
@@ -125,7 +116,8 @@ class Resampler:
         self.size = (resized.width, resized.height)
         """Width and height to which images are resized before they are resampled."""
         self._resized = resized
-        self._distortion, self._lens = source.distortion, source.lens
+        self._distortion = source.distortion
+        self._lens = source.lens
         self._target = target
         self._keeps_maps = keeps_maps
         self._kept: tuple[np.ndarray, np.ndarray] | None = None

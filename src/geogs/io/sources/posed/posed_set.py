@@ -1,8 +1,7 @@
 """An image set as its format describes it: files, poses, cameras, points."""
 
-import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ from jaxtyping import Float64, Int64
 
 from geogs.errors import InputError
 from geogs.io.pose_files import is_rigid, says_pose
+from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +69,12 @@ class PosedSet:
     points: SparsePoints | None = None
     left_out: tuple[tuple[str, str], ...] = ()
     """Names of images that have no pose, each with the reason as a clause."""
+    account: Account = field(default_factory=Account)
+    """Findings of the reader beside the images."""
+
+    def left(self, sentence: str) -> "PosedSet":
+        """The set with one more sentence on what is not used."""
+        return replace(self, account=self.account + Account(left=(sentence,)))
 
     def only(self, kept: Sequence[int]) -> "PosedSet":
         """The set reduced to the images ``kept``, in this order."""
@@ -85,16 +89,15 @@ def without_invalid_poses(posed: PosedSet) -> PosedSet:
         InputError: no pose is left, or they are mirrored or scaled altogether.
     """
     T = np.stack([file.T_cw for file in posed.files])
-    valid, has_pose = is_rigid(T), says_pose(T)
+    valid = is_rigid(T)
+    has_pose = says_pose(T)
     if valid.sum() < 0.5 * has_pose.sum():
         _refuse(posed, T[has_pose, :3, :3])
     if not valid.any():
         raise InputError(f"{posed.name} holds no valid pose: all {len(T)} are NaN, inf or zero.")
     if not valid.all():
-        _log.warning(
-            "%s: left out %d of %d images, whose poses are invalid (NaN, inf or no rotation).",
-            posed.name, int((~valid).sum()), len(valid),
-        )  # fmt: skip
+        count = f"{int((~valid).sum())} of {len(valid)} images"
+        posed = posed.left(f"{count}, whose poses are invalid (NaN, inf or no rotation)")
     posed = posed.only(np.flatnonzero(valid).tolist())
     return replace(
         posed, files=tuple(replace(file, T_cw=_rigid(file.T_cw)) for file in posed.files)

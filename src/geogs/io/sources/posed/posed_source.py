@@ -1,8 +1,8 @@
 """A source of images with known poses: every image at working size in one pinhole camera."""
 
-import logging
+import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -10,13 +10,12 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.io.sources.account import Account, named
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_set import PosedSet, SparsePoints, without_invalid_poses
 from geogs.io.sources.posed.stored_pictures import stored_size
 from geogs.io.sources.reader import fingerprint_of, read_ahead, size_of
 from geogs.io.sources.working_images import check_large_enough
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +50,12 @@ class PosedSource:
         """Indices of the images left out, in the source with neither start nor stride, from 0."""
         if left_out:
             posed = posed.only(sorted(set(range(len(posed.files))) - set(left_out)))
+        self._one_camera = OneCamera(posed.files, config)
+        if unlike := self._one_camera.unlike():
+            posed = _without_unlike(posed, unlike)
+            self._one_camera = OneCamera(posed.files, config)
+        self._config = config
+        self._found = posed.account
         self._files = posed.files
         self.kind = posed.kind
         """The format: colmap, nerfstudio, dtu, replica, tum, 7scenes, scannet or photographs."""
@@ -68,8 +73,8 @@ class PosedSource:
             [file.timestamp for file in posed.files], dtype=np.float64
         )
         """Seconds."""
-        self._one_camera = OneCamera(posed.files, config)
-        self._one_camera.check()
+        self.pose_error: dict[str, int | float] = {}
+        """Agreement of poses and camera with matches between the images, once that was checked."""
         check_large_enough(self._one_camera.camera, posed.name)
 
     @property
@@ -78,9 +83,36 @@ class PosedSource:
         return self._one_camera.camera
 
     @property
+    def found(self) -> str:
+        """The images, in words."""
+        size = "x".join(map(str, stored_size(self._files[0].path) or ("?", "?")))
+        return f"{self.name}, {self.length} images of {size} with poses ({self.kind})"
+
+    @property
+    def account(self) -> Account:
+        """Findings beside the images: those used, and those not used with the reason."""
+        return self._one_camera.account + self._found
+
+    @property
     def intrinsics_origin(self) -> str:
         """Origin of the intrinsics."""
-        return self._one_camera.origin
+        return self._one_camera.calibration.origin
+
+    @property
+    def is_focal_guess(self) -> bool:
+        """Whether the focal length is only assumed."""
+        return self._one_camera.calibration.is_guess
+
+    def with_focal(self, factor: float, deviation: float) -> "PosedSource":
+        """The same images with the focal length times a factor, of a relative deviation."""
+        assumed = self._one_camera.calibration
+        fx = assumed.fx * factor
+        origin = f"estimated from images and poses, standard deviation {fx * deviation:.1f}"
+        found = replace(assumed, fx=fx, fy=assumed.fy * factor, is_guess=False, origin=origin)
+        same = copy.copy(self)
+        same._files = tuple(replace(file, calibration=found) for file in self._files)
+        same._one_camera = OneCamera(same._files, replace(self._config, intrinsics="auto"))
+        return same
 
     @property
     def length(self) -> int:
@@ -152,12 +184,25 @@ def _present(posed: PosedSet) -> PosedSet:
             f"{posed.name}: none of its {missing} images can be read, such as "
             f"{posed.files[0].path}; put them there."
         )
-    if missing:
-        _log.warning(
-            "%s: left out %d of %d images, which are missing or damaged.",
-            posed.name, missing, len(posed.files),
-        )  # fmt: skip
-    return posed.only(kept) if missing else posed
+    if not missing:
+        return posed
+    count = f"{missing} of {len(posed.files)} images"
+    return posed.only(kept).left(f"{count}, which are missing or damaged")
+
+
+def _without_unlike(posed: PosedSet, unlike: dict[int, str]) -> PosedSet:
+    """The set without images by quite another camera than most."""
+    kept = [k for k in range(len(posed.files)) if k not in unlike]
+    if len(kept) < 2:
+        raise InputError(
+            f"{posed.name}: hardly two of its {len(posed.files)} images are by one camera; give "
+            "images of one camera, or undistort and crop them to one."
+        )
+    cameras = named([*dict.fromkeys(unlike.values())])
+    return posed.only(kept).left(
+        f"{len(unlike)} of {len(posed.files)} images, taken with quite another camera than most "
+        f"({cameras})"
+    )
 
 
 def _selected(posed: PosedSet, config: InputConfig) -> PosedSet:

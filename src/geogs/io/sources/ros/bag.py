@@ -1,7 +1,7 @@
 """Bags of ROS 1 (``.bag``) and ROS 2 (a folder, ``.db3``, ``.mcap``), read without ROS."""
 
-import logging
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,7 @@ from geogs.documents import (
     yaml_value,
 )
 from geogs.errors import GeogsError, InputError
+from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.reader import RawFrame, RecordingInfo, median_rate
 from geogs.io.sources.ros.recorded_messages import (
@@ -25,11 +26,10 @@ from geogs.io.sources.ros.recorded_messages import (
     COMPRESSED,
     RAW,
     calibration_of,
-    is_picture,
     picture_of,
+    shows,
 )
-
-_log = logging.getLogger(__name__)
+from geogs.io.sources.tones import ASKED, tones_of
 
 _BEGINNINGS = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _METADATA = "metadata.yaml"
@@ -37,6 +37,16 @@ _SUFFIXES = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg")
 """Suffixes that image transports add to the name of a topic."""
 _LOOKED_AT = 30
 """Number of messages used for the rate; the first picture must be among them."""
+_OTHER = re.compile(
+    "infra|/ir/|thermal|depth|mask|debug|track|feature|detect|overlay|annotat|segment|match"
+)
+"""Words in topics of other than the camera's own colour or grey images."""
+_LEFT = {
+    ("colour", "grey"): "images of {}: --topic takes another",
+    ("depth",): "depth of {}: that of bags is not read",
+    ("",): "images of {}: their encoding is not read",
+}
+"""Sentences on other topics, by their content."""
 
 
 def is_bag(path: Path) -> bool:
@@ -59,19 +69,25 @@ class Bag:
         """
         self._path = path
         with _opened(path) as bag:
-            chosen = _chosen(bag, path, topic)
+            chosen, account = _chosen(bag, path, topic)
             self.topic: str = chosen
             """Topic of the images that are read."""
             connections = _connections(bag, chosen)
-            length = sum(c.msgcount for c in connections)
             times = [t for _, t, _ in islice(bag.messages(connections=connections), _LOOKED_AT)]
-            fps = median_rate(np.diff(np.array(times, dtype=np.float64)) * 1e-9)
-            first = _first_picture(bag, connections)
+            first = next(_pictures(islice(_messages(bag, chosen), _LOOKED_AT)), None)
             if first is None:
                 raise InputError(f"{path}: no image on {chosen} can be read; is the bag whole?")
-            (height, width), calibration = first.shape[:2], _calibration(bag, chosen)
+            self._tones = tones_of(_sample(bag, chosen) if first.dtype != np.uint8 else ())
+            height, width = first.shape[:2]
             self.info = RecordingInfo(
-                "bag", path.resolve().name, width, height, fps, length, calibration
+                "bag",
+                path.resolve().name,
+                width,
+                height,
+                fps=median_rate(np.diff(np.array(times, dtype=np.float64)) * 1e-9),
+                length=sum(c.msgcount for c in connections),
+                calibration=_calibration(bag, chosen),
+                account=account + self._tones.account,
             )
 
     @property
@@ -102,8 +118,10 @@ class Bag:
                     late = "is stamped no later than the one before"
                     yield RawFrame(label, time, None, why_not=late)
                     continue
-                last, found = time, picture_of(message)
-                yield RawFrame(label, time, found.picture, found.is_damaged)
+                last = time
+                found = picture_of(message)
+                image = None if found.picture is None else self._tones(found.picture)
+                yield RawFrame(label, time, image, found.is_damaged)
 
 
 @contextmanager
@@ -153,60 +171,77 @@ def _require_files(path: Path) -> None:
         require_file(path / name)
 
 
-def _chosen(bag: Any, path: Path, asked: str) -> str:
-    """The topic to read: the given one, or the likeliest. Raises InputError without any."""
+def _chosen(bag: Any, path: Path, asked: str) -> tuple[str, Account]:
+    """The topic to read, the given one or the likeliest, and what is said of all.
+
+    Raises:
+        InputError: there are no images, or none on the given topic.
+    """
     topics = {t: info.msgcount for t, info in bag.topics.items() if _has_images(bag, t)}
     listed = ", ".join(sorted(topics)) or "none"
-    if asked != "auto":
-        if asked not in topics:
-            raise InputError(f"{path} has no images on the topic asked for; there are: {listed}.")
-        return asked
-    likely = [t for t in sorted(topics) if _first_is_picture(bag, t)]
-    if not likely:
+    if asked != "auto" and asked not in topics:
+        raise InputError(f"{path} has no images on the topic asked for; there are: {listed}.")
+    kinds = {topic: _shown(bag, topic) for topic in sorted(topics)}
+
+    def likelihood(topic: str) -> tuple[bool, bool, bool, bool, int]:
+        """Colour before infrared and grey, with camera info before without, raw before compressed;
+        of equal ones the first by name, the left of two."""
+        base = _without_transport(topic)
+        return (
+            not _OTHER.search(base.lower()),
+            kinds[topic] == "colour",
+            _camera_topic(bag, topic) is not None,
+            base == topic,
+            topics[topic],
+        )
+
+    likely = [topic for topic, kind in kinds.items() if kind in ("colour", "grey")]
+    chosen = max(likely, key=likelihood, default="") if asked == "auto" else asked
+    if not chosen:
         raise InputError(f"{path} holds no topic with images; topics with some: {listed}.")
-    chosen = max(likely, key=lambda t: (_likelihood(bag, t), topics[t]))
-    if len(likely) > 1:
-        _log.info("Reading %s; --topic takes another of %s.", chosen, ", ".join(likely))
-    return chosen
-
-
-def _likelihood(bag: Any, topic: str) -> tuple[bool, bool, bool]:
-    """Sort key: colour before infrared, with camera info before without, raw before compressed; of
-    equal ones the first by name, the left of two."""
-    base = _without_transport(topic).lower()
-    is_other = any(word in base for word in ("infra", "/ir/", "thermal", "depth", "mask", "debug"))
-    return not is_other, _camera_topic(bag, topic) is not None, base == topic.lower()
+    if kinds[chosen] == "depth":
+        raise InputError(f"{path}: {asked} shows depth, not images; there are: {listed}.")
+    left = []
+    for shown, sentence in _LEFT.items():
+        others = [topic for topic in kinds if kinds[topic] in shown and topic != chosen]
+        left += [sentence.format(named(others))] if others else []
+    return chosen, Account((f"images: topic {chosen}",), tuple(left))
 
 
 def _has_images(bag: Any, topic: str) -> bool:
     return any(c.msgtype in (RAW, COMPRESSED) and c.msgcount for c in _connections(bag, topic))
 
 
-def _first_is_picture(bag: Any, topic: str) -> bool:
-    connections = _connections(bag, topic)
-    some = islice(bag.messages(connections=connections), 1)
-    messages = [_read(bag, connection, data) for connection, _, data in some]
-    return any(m is not None and is_picture(m) for m in messages)
+def _messages(bag: Any, topic: str, start: int | None = None) -> Iterator[Any]:
+    """The messages of a topic from a time on; none for a damaged one."""
+    for connection, _, data in bag.messages(connections=_connections(bag, topic), start=start):
+        yield _read(bag, connection, data)
 
 
-def _first_picture(bag: Any, connections: Sequence[Any]) -> np.ndarray | None:
-    for connection, _, data in islice(bag.messages(connections=connections), _LOOKED_AT):
-        message = _read(bag, connection, data)
-        if message is not None and (found := picture_of(message).picture) is not None:
-            return found
-    return None
+def _pictures(messages: Iterable[Any]) -> Iterator[np.ndarray]:
+    """The pictures of those messages that hold one."""
+    found = (picture_of(message).picture for message in messages if message is not None)
+    return (picture for picture in found if picture is not None)
+
+
+def _shown(bag: Any, topic: str) -> str:
+    """Content of the first whole message of a topic, see :func:`shows`."""
+    first = islice(_messages(bag, topic), _LOOKED_AT)
+    return next((shows(message, topic) for message in first if message is not None), "")
+
+
+def _sample(bag: Any, topic: str) -> Iterator[np.ndarray]:
+    """Some pictures spread over the bag."""
+    for time in np.linspace(bag.start_time, bag.end_time, ASKED, endpoint=False).astype(int):
+        yield from _pictures(islice(_messages(bag, topic, int(time)), 1))
 
 
 def _calibration(bag: Any, topic: str) -> Calibration | None:
     source = _camera_topic(bag, topic)
-    if source is None:
+    if source is None or (message := next(_messages(bag, source), None)) is None:
         return None
     is_rectified = _without_transport(topic).rsplit("/", 1)[-1].startswith("image_rect")
-    for connection, _, data in islice(bag.messages(connections=_connections(bag, source)), 1):
-        message = _read(bag, connection, data)
-        if message is not None:
-            return calibration_of(message, source, is_rectified)
-    return None
+    return calibration_of(message, source, is_rectified)
 
 
 def _camera_topic(bag: Any, topic: str) -> str | None:

@@ -1,40 +1,49 @@
 """Content of ROS messages: pictures (``sensor_msgs/Image``, ``CompressedImage``) and the camera
 (``sensor_msgs/CameraInfo``) of unprocessed images."""
 
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped
 
 from geogs.errors import InputError
-from geogs.io.pictures import Decoded, decoded_bytes
+from geogs.io.pictures import DEEP, Decoded, decoded_bytes
 from geogs.io.sources.calibration import Calibration
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 """Names of the types; ``rosbags`` gives those of ROS 1 the same names."""
 
-# Bytes per pixel, and OpenCV's conversion to RGB; none where it is RGB already.
-# OpenCV names Bayer patterns by the second row and column, ROS by the first.
-_TO_RGB: dict[str, tuple[int, int | None]] = {
-    "rgb8": (3, None),
-    "bgr8": (3, cv2.COLOR_BGR2RGB),
-    "8uc3": (3, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, cv2.COLOR_BGRA2RGB),
-    "8uc4": (4, cv2.COLOR_BGRA2RGB),
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8uc1": (1, cv2.COLOR_GRAY2RGB),
-    "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
-    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8 rgb16": (3, None),
+    "bgr8 bgr16 8uc3 16uc3": (3, cv2.COLOR_BGR2RGB),
+    "rgba8 rgba16": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8 bgra16 8uc4 16uc4": (4, cv2.COLOR_BGRA2RGB),
+    "mono8 mono16 8uc1 16uc1": (1, cv2.COLOR_GRAY2RGB),
+    # OpenCV names Bayer patterns by the second row and column, ROS by the first.
+    "bayer_rggb8 bayer_rggb16": (1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8 bayer_bggr16": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8 bayer_gbrg16": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8 bayer_grbg16": (1, cv2.COLOR_BayerGB2RGB),
+    "uyvy yuv422 yuv422_uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuyv yuy2 yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "yvyu": (2, cv2.COLOR_YUV2RGB_YVYU),
+    "nv12": (1, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": (1, cv2.COLOR_YUV2RGB_NV21),
+    "i420 yuv420": (1, cv2.COLOR_YUV2RGB_I420),
 }
-_MONO_16 = "mono16"
+"""Values per pixel of a row, and OpenCV's conversion to RGB, by the names of an encoding."""
+_BY_NAME = {name: said for names, said in _ENCODINGS.items() for name in names.split()}
+_WITH_ROWS_OF_COLOUR = (cv2.COLOR_YUV2RGB_NV12, cv2.COLOR_YUV2RGB_NV21, cv2.COLOR_YUV2RGB_I420)
+"""Conversions of images where half as many rows with colours follow those of brightness."""
+_MAY_BE_DEPTH = ("16uc1", "mono16")
+"""Encodings that are depth on a topic of that name, else pictures of 16 bits."""
+_DEPTH = ("32fc1", "compresseddepth")
+_DEPTH_TOPICS = ("depth", "disparity")
+_COLOURED = 1.0
+"""Least mean difference of red and blue in a colour image, as levels of 256: JPEG gives grey ones
+less."""
 _LARGEST = 1 << 16
 """Longest side in pixels."""
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -43,44 +52,53 @@ _FISHEYES = ("equidistant", "fisheye")
 _POLYNOMIALS = ("plumb_bob", "rational_polynomial", "")
 
 
-def is_picture(message: Any) -> bool:
-    """Whether a message of one of the two types holds a readable colour or grey image.
-
-    Depth and disparity come in the same types.
-    """
-    if hasattr(message, "format"):
-        return "compresseddepth" not in str(message.format).lower()
-    encoding = str(message.encoding).lower()
-    return encoding in _TO_RGB or encoding == _MONO_16
+def shows(message: Any, topic: str) -> Literal["colour", "grey", "depth", ""]:
+    """Content of a message of one of the two types; empty where it is not read here."""
+    words = str(getattr(message, "format", getattr(message, "encoding", ""))).lower()
+    encoding = words.split(";")[0].strip()
+    is_depth = any(word in topic.lower() for word in _DEPTH_TOPICS)
+    if any(word in words for word in _DEPTH) or (is_depth and encoding in _MAY_BE_DEPTH):
+        return "depth"
+    if not hasattr(message, "format") and encoding not in _BY_NAME:
+        return ""
+    picture = picture_of(message).picture
+    if picture is None:
+        return "grey"
+    levels = picture.astype(np.float32) * (1 / 256 if picture.dtype == np.uint16 else 1)
+    return "colour" if np.abs(levels[..., 0] - levels[..., 2]).mean() > _COLOURED else "grey"
 
 
 def picture_of(message: Any) -> Decoded:
-    """The RGB image of a message; none where the message is damaged."""
+    """The RGB image of a message, of any number of bits; none where the message is damaged."""
     if not hasattr(message, "format"):
         return Decoded(_raw(message))
-    found = decoded_bytes(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
-    return Decoded(found.rgb, found.is_damaged)
+    found = decoded_bytes(np.asarray(message.data, np.uint8), DEEP)
+    if found.picture is None:
+        return found
+    return Decoded(cv2.cvtColor(found.picture, cv2.COLOR_BGR2RGB), found.is_damaged)
 
 
-def _raw(message: Any) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Decode a raw image; rows may be padded, and 16-bit grey loses the lower eight bits."""
-    encoding, width, height = str(message.encoding).lower(), message.width, message.height
-    is_16_bit = encoding == _MONO_16
-    bytes_a_pixel, code = (2, None) if is_16_bit else _TO_RGB.get(encoding, (0, None))
-    data, step = np.asarray(message.data, np.uint8), message.step
-    is_sized = 0 < width <= _LARGEST and 0 < height <= _LARGEST
-    is_whole = len(data) >= height * step and step >= width * bytes_a_pixel > 0
-    if not (is_sized and is_whole):
+def _raw(message: Any) -> Shaped[np.ndarray, "h w 3"] | None:
+    """Decode a raw image; its rows may be padded."""
+    encoding = str(message.encoding).lower()
+    width = message.width
+    height = message.height
+    if encoding not in _BY_NAME or not (0 < width <= _LARGEST and 0 < height <= _LARGEST):
         return None
-    rows = data[: height * step].reshape(height, step)[:, : width * bytes_a_pixel]
-    pixels = np.ascontiguousarray(rows).reshape(height, width, bytes_a_pixel)
-    if is_16_bit:
-        upper = pixels[..., 0 if message.is_bigendian else 1]
-        return np.repeat(upper[..., None], 3, axis=2)
+    channels, code = _BY_NAME[encoding]
+    kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{2 if '16' in encoding else 1}")
+    used = width * channels * kind.itemsize
+    lines = height + height // 2 if code in _WITH_ROWS_OF_COLOUR else height
+    data = np.asarray(message.data, np.uint8)
+    step = used if len(data) == lines * used else message.step
+    if len(data) < lines * step or step < used:
+        return None
+    rows = np.ascontiguousarray(data[: lines * step].reshape(lines, step)[:, :used]).view(kind)
+    pixels = rows.astype(kind.newbyteorder("=")).reshape(lines, width, channels)
     if code is None:
         return pixels
     try:
-        return cv2.cvtColor(pixels[..., 0] if bytes_a_pixel == 1 else pixels, code)
+        return cv2.cvtColor(pixels[..., 0] if channels == 1 else pixels, code)
     except cv2.error:  # such as YUV of an odd width
         return None
 
@@ -101,23 +119,21 @@ def calibration_of(message: Any, topic: str, is_rectified: bool) -> Calibration 
     fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if is_rectified else (K[0], K[4], K[2], K[5])
     if fx == 0 or fy == 0:
         return None
-    model, distortion = str(message.distortion_model).lower(), tuple(D)
+    model = str(message.distortion_model).lower()
+    distortion = tuple(D) if any(D) and not is_rectified else ()
     is_fisheye = model in _FISHEYES and not is_rectified
-    if is_rectified or not any(distortion):
-        distortion = ()
-    elif is_fisheye:
-        pass
-    elif model not in _POLYNOMIALS:
+    if distortion and model not in (*_FISHEYES, *_POLYNOMIALS):
         raise InputError(
             f"The lens of {topic} is of a model that is not supported; undistort the images first."
         )
-    elif len(distortion) > 8 and not any(distortion[8:]):
+    if not is_fisheye and not any(distortion[8:]):
         distortion = distortion[:8]
     # K is for the whole sensor; a region of interest moves its corner, binning only scales.
     roi = message.roi
     is_part = roi.width > 0 and roi.height > 0
     return Calibration(
-        fx, fy,
+        fx,
+        fy,
         cx - roi.x_offset if is_part else cx,
         cy - roi.y_offset if is_part else cy,
         distortion=distortion,
@@ -125,7 +141,7 @@ def calibration_of(message: Any, topic: str, is_rectified: bool) -> Calibration 
         height=int(roi.height if is_part else message.height) or None,
         origin=f"{topic} of the bag",
         lens="fisheye" if is_fisheye else "polynomial",
-    )  # fmt: skip
+    )
 
 
 def _entry(message: Any, name: str) -> list[float]:

@@ -57,7 +57,8 @@ def write_colmap_model(
     Raises:
         OutputError: a file cannot be written.
     """
-    names, poses = [image.name for image in images], [_pose(image.T_cw) for image in images]
+    names = [image.name for image in images]
+    poses = [_pose(image.T_cw) for image in images]
     seen = [_observations(points, number) for number in range(len(images))]
     model = _Model(camera, names, poses, points, seen, _tracks(points))
     write = _write_text if as_text else _write_binary
@@ -112,7 +113,8 @@ def _write_text(folder: Path, model: _Model) -> None:
 
 
 def _write_binary(folder: Path, model: _Model) -> None:
-    camera, points = model.camera, model.points
+    camera = model.camera
+    points = model.points
     with atomic_file(folder / "cameras.bin") as stream:
         stream.write(struct.pack("<QIiQQ", 1, 1, _PINHOLE, camera.width, camera.height))
         stream.write(struct.pack("<4d", *model.parameters))
@@ -126,7 +128,8 @@ def _write_binary(folder: Path, model: _Model) -> None:
     with atomic_file(folder / "points3D.bin") as stream:
         stream.write(struct.pack("<Q", len(model.tracks)))
         for number, track in enumerate(model.tracks):
-            position, colour = points.positions[number].tolist(), points.colours[number].tolist()
+            position = points.positions[number].tolist()
+            colour = points.colours[number].tolist()
             stream.write(struct.pack("<Q3d3Bd", number + 1, *position, *colour, _UNKNOWN_ERROR))
             stream.write(struct.pack("<Q", len(track)) + track.astype("<u4").tobytes())
 

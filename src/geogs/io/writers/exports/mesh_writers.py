@@ -74,8 +74,10 @@ class GltfBuffer:
         filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP}
         surface = {"baseColorTexture": {"index": 0}, **_ROUGH}
         material = {
-            "pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {_UNLIT: {}},
-        }  # fmt: skip
+            "pbrMetallicRoughness": surface,
+            "doubleSided": True,
+            "extensions": {_UNLIT: {}},
+        }
         return {
             "extensionsUsed": [_UNLIT],
             "materials": [material],
@@ -98,14 +100,19 @@ class GltfBuffer:
             "bufferViews": self._views,
             "buffers": [{"byteLength": len(self._data)}],
         }
-        text, data = json.dumps(document).encode(), self._data
+        text = json.dumps(document).encode()
+        data = self._data
         text += b" " * (-len(text) % 4)
         data += b"\0" * (-len(data) % 4)
-        return b"".join([
-            struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)),
-            struct.pack("<I4s", len(text), b"JSON"), text,
-            struct.pack("<I4s", len(data), b"BIN\0"), data,
-        ])  # fmt: skip
+        return b"".join(
+            [
+                struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)),
+                struct.pack("<I4s", len(text), b"JSON"),
+                text,
+                struct.pack("<I4s", len(data), b"BIN\0"),
+                data,
+            ]
+        )
 
     def _accessor(self, values: np.ndarray, target: int, entry: dict[str, object]) -> int:
         view = self._view(values.tobytes(), {"target": target})
@@ -156,7 +163,8 @@ def write_textured_glb(
     without that extension show a rough surface. ``uv`` is in pixels of the texture, whose
     centres are at integers.
     """
-    gltf, size = GltfBuffer(), np.array(texture.shape[1::-1])
+    gltf = GltfBuffer()
+    size = np.array(texture.shape[1::-1])
     attributes = gltf.add_surface(vertices, normals)
     attributes["TEXCOORD_0"] = gltf.add((uv + 0.5) / size, "VEC2")
     corners = gltf.add_corners(faces)

@@ -31,9 +31,12 @@ class KnownViews:
 
     def slots(self, views: Sequence[MapView]) -> list[int]:
         """The table's slots of some views, with their present constants and poses."""
-        moved, slots, wanted = {}, [], {view.id for view in views}
+        moved = {}
+        slots = []
+        wanted = {view.id for view in views}
         for view in views:
-            constants, is_new = view.constants, view.id not in self._slots
+            constants = view.constants
+            is_new = view.id not in self._slots
             slot = self._slots.get(view.id, partial(self._new_slot, view), wanted)
             if not is_new and self._constants[view.id] is not constants:
                 self.table.set_constants(slot, constants)

@@ -31,8 +31,8 @@ def refine_poses(
     once, for the gradients of the poses; the descent itself runs on the CPU.
     """
     partners = [views[i] for view in active for i in view.row.partners[:1]]
-    slot = dict(zip((v.id for v in (*active, *partners)), known.slots([*active, *partners]),
-                    strict=True))  # fmt: skip
+    both = [*active, *partners]
+    slot = dict(zip((v.id for v in both), known.slots(both), strict=True))
     rows = [slot[v.id] for v in active]
     rows += [slot[v.row.partners[0]] if v.row.partners else -1 for v in active]
     window.slots.copy_(to_device(torch.tensor(rows, dtype=torch.int32), disks.device))
@@ -51,7 +51,9 @@ def _evaluate(
     window: WindowPass, disks: GaussianMap, count: Int[Tensor, "1"]
 ) -> tuple[float, Float[Tensor, "b 4 4"], Float[Tensor, "b 3 4"]]:
     """Summed loss and gradients of poses and motions, fetched in one transfer."""
-    d_poses, d_motions, n = window.d_poses, window.d_motions, window.views
+    d_poses = window.d_poses
+    d_motions = window.d_motions
+    n = window.views
     assert d_poses is not None
     assert d_motions is not None
     status = window.rasterizer.status

@@ -41,17 +41,16 @@ class CudaTrainer:
         unit: float,
         resident: int,
     ) -> None:
-        self.disks, self.cameras, self.config, self.unit = disks, cameras, config, unit
+        self.disks = disks
+        self.config = config
+        self.unit = unit
         self.known = KnownViews(cameras, disks.device, resident)
         self._programs: dict[tuple[int, int], _TrainingStep] = {}
         self._pose_pass: WindowPass | None = None
         self.coarse_part = 0.0
 
     def train(
-        self,
-        batches: Sequence[Batch],
-        factors: Sequence[float] | None = None,
-        coarse: bool = False,
+        self, batches: Sequence[Batch], factors: Sequence[float] | None = None, coarse: bool = False
     ) -> None:
         """Adam steps on the summed losses of each batch of views with their partners."""
         assert not coarse, "a GPU trains at the full resolution"
@@ -76,11 +75,11 @@ class CudaTrainer:
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
         window = self._pose_pass
         if window is None or window.views != len(active) or window.is_outdated(self.disks):
-            table, camera = self.known.table, self.cameras.render
+            table = self.known.table
+            room = self.disks.capacity
             window = WindowPass(
-                table, camera, config.pose_loss, self.unit, len(active), 1, 1.0,
-                self.disks.capacity, for_poses=True,
-            )  # fmt: skip
+                table, config.pose_loss, self.unit, len(active), 1, 1.0, room, for_poses=True
+            )
             self._pose_pass = window
         return refine_poses(self.disks, active, views, self.known, window, config, self.unit)
 
@@ -101,16 +100,25 @@ class _TrainingStep:
     """One training step of a given size, as a CUDA graph where there is a GPU."""
 
     def __init__(self, trainer: CudaTrainer, views: int, partners: int) -> None:
-        disks, config = trainer.disks, trainer.config
-        self._trainer, self._device = trainer, disks.device
+        disks = trainer.disks
+        config = trainer.config
+        self._trainer = trainer
+        self._device = disks.device
         self._capacity = disks.capacity
         self._kernels = kernels_for(_ADAM, disks.device)
         self.window = WindowPass(
-            trainer.known.table, trainer.cameras.render, config.loss, trainer.unit, views, partners,
-            1 / config.photo.per_step, disks.capacity, fresh=config.photo.fresh,
-        )  # fmt: skip
+            trainer.known.table,
+            config.loss,
+            trainer.unit,
+            views,
+            partners,
+            1 / config.photo.per_step,
+            disks.capacity,
+            fresh=config.photo.fresh,
+        )
         integers = torch.zeros(2, dtype=torch.int32, device=disks.device)
-        self._count, self._completed = integers[:1], integers[1:]
+        self._count = integers[:1]
+        self._completed = integers[1:]
         self._base, self._rates = torch.zeros(2, 4, device=disks.device)
         self._schedule = torch.zeros(0, len(self.window.slots), dtype=torch.int32)
         self._factors = torch.zeros(0)
@@ -157,13 +165,13 @@ class _TrainingStep:
             self._graph = graph
 
     def _launch(self) -> None:
-        trainer, p, room = self._trainer, self.window, self._trainer.disks.room
+        trainer = self._trainer
+        p = self.window
+        room = self._trainer.disks.room
         disk = trainer.config.disk
         assert p.d_disks is not None
-        self._kernels["begin_step"](
-            1, 64, len(p.slots), self._schedule, self._factors, self._completed, self._base,
-            p.slots, self._rates,
-        )  # fmt: skip
+        schedule = (self._schedule, self._factors, self._completed, self._base)
+        self._kernels["begin_step"](1, 64, len(p.slots), *schedule, p.slots, self._rates)
         p.launch(room, self._count)
         bounds = (np.log(disk.min_scale * trainer.unit), np.log(disk.max_scale * trainer.unit))
         self._kernels["adam_step"](

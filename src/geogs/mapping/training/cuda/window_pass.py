@@ -5,7 +5,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.config import LossConfig
-from geogs.geometry.camera import Camera
 from geogs.losses.cuda.view_table import ViewTable
 from geogs.losses.cuda.window_losses import WindowLosses
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
@@ -23,7 +22,6 @@ class WindowPass:
     def __init__(
         self,
         table: ViewTable,
-        camera: Camera,
         config: LossConfig,
         unit: float,
         views: int,
@@ -35,20 +33,24 @@ class WindowPass:
     ) -> None:
         """``fresh`` renders all partners first, for the occlusion tests of this pass."""
         device = table.device
-        self.table, self.views, self.capacity = table, views, capacity
+        camera = table.render
+        self.table = table
+        self.views = views
+        self.capacity = capacity
         self._generation = table.generation
         self.rasterizer = Rasterizer(capacity, views, camera, NEAR, device)
         self.losses = WindowLosses(table, config, unit, views, partners, pair_weight, for_poses)
         self.maps = Maps.empty(camera, (views,), capacity, device)
         m = self.maps
+        zero = torch.zeros_like
         self._gradients = MapGradients(
-            torch.zeros_like(m.depth), torch.zeros_like(m.normal), torch.zeros_like(m.alpha),
-            torch.zeros_like(m.distortion),
-        )  # fmt: skip
+            zero(m.depth), zero(m.normal), zero(m.alpha), zero(m.distortion)
+        )
         slots = torch.full((views * (1 + partners),), -1, dtype=torch.int32, device=device)
         self.slots: Int[Tensor, "s"] = slots
         """Batch, then pairs, in one piece."""
-        self.batch, self.pairs = slots[:views], slots[views:].view(views, partners)
+        self.batch = slots[:views]
+        self.pairs = slots[views:].view(views, partners)
         self._partners: tuple[Rasterizer, Maps] | None = None
         if fresh and partners > 0:
             shown = Rasterizer(capacity, views * partners, camera, NEAR, device)
@@ -88,7 +90,8 @@ class WindowPass:
             shown.blend(seen, maps, with_trace=False)
             self.losses.store_rendered(others, maps.depth, maps.alpha)
         views = Views(self.table.poses, self.batch, count)
-        m, d = self.maps, self._gradients
+        m = self.maps
+        d = self._gradients
         self.rasterizer.project(disks, views, m)
         self.rasterizer.blend(views, m)
         self.losses.launch(

@@ -1,4 +1,4 @@
-// Parallel edge collapse: what collapse_kernels.py does for a CPU, one thread per vertex or face.
+// Parallel edge collapse: what decimation_kernels.py does for a CPU, one thread per vertex or face.
 // Corner 3 f + k is that of face f at its k-th vertex, and stands for the edge from there to the
 // next vertex of the face. The corners at vertex v are corners[first[v]] to corners[first[v + 1]].
 #include "common.cuh"

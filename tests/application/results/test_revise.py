@@ -1,0 +1,126 @@
+"""A saved result brought to metres, or given another mesh."""
+
+import json
+
+import numpy as np
+import pytest
+
+import geogs
+from geogs.application.result_settings import RemeshSettings, RescaleSettings
+from geogs.application.results.revise import mesh_settings, remesh, rescale
+from geogs.application.results.surfaces import fusion_views
+from geogs.cli.main import main
+from geogs.config import MeshConfig
+from geogs.errors import InputError
+from geogs.io.ply_reader import read_ply
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.ply_writer import write_splats
+from geogs.mesh.extract import extract_mesh
+from saved_results import BLOCK, CAMERA, ORIGIN, UNIT, WALL, make_result
+
+FINE = MeshConfig(voxel=0.12, min_component_faces=10)
+METRES = 1.5
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A result with everything in it."""
+    folder = make_result(tmp_path)
+    disks = geogs.load_result(folder).disks
+    write_splats(folder / "splats.ply", disks, np.full((len(disks), 3), 0.25))
+    write_intrinsics(folder / "intrinsics.json", CAMERA)
+    remesh(RemeshSettings(folder, FINE, device="cpu"))
+    (folder / "summary.json").write_text('{"source": "planes", "scale": "arbitrary", "frames": 5}')
+    (folder / "trajectory_uncertainty.csv").write_text(
+        "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth\n"
+        "0.0,tracked,0.02,0.1,0.01\n0.1,lost,,,\n"
+    )
+    return folder
+
+
+def test_every_length_is_multiplied(folder):
+    # Two pixels of the wall in the first frame, of which the depth is known.
+    u, v = (8.0, 70.0), (6.0, 52.0)
+    x = [(c - CAMERA.cx) / CAMERA.fx * WALL * UNIT for c in u]
+    y = [(r - CAMERA.cy) / CAMERA.fy * WALL * UNIT for r in v]
+    units = float(np.hypot(x[1] - x[0], y[1] - y[0]))
+    before = geogs.load_result(folder)
+    poses, keyframe = before.trajectory.T_wc, before.keyframes[1]
+    depth, vertices = keyframe.depth.numpy(), before.mesh.vertices
+    splats = read_ply(folder / "splats.ply")["vertex"].columns
+    known = f"0:{u[0]},{v[0]},{u[1]},{v[1]}={METRES * units}"
+    found = rescale(RescaleSettings(folder, known, "cpu"))
+    assert found.factor == pytest.approx(METRES, rel=0.01)
+    after = geogs.load_result(folder)
+    np.testing.assert_allclose(after.trajectory.T_wc[:, :3, 3], found.factor * poses[:, :3, 3])
+    np.testing.assert_allclose(after.trajectory.T_wc[:, :3, :3], poses[:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(after.keyframes[1].depth.numpy(), found.factor * depth, rtol=1e-4)
+    np.testing.assert_allclose(after.mesh.vertices, found.factor * vertices, rtol=1e-5)
+    scaled = read_ply(folder / "splats.ply")["vertex"].columns
+    np.testing.assert_allclose(scaled["x"], found.factor * splats["x"], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        scaled["scale_0"], splats["scale_0"] + np.log(found.factor), atol=1e-4
+    )
+    np.testing.assert_allclose(scaled["f_dc_1"], splats["f_dc_1"], atol=1e-5)
+    table = (folder / "trajectory_uncertainty.csv").read_text().splitlines()
+    assert float(table[1].split(",")[2]) == pytest.approx(0.02 * found.factor, rel=1e-4)
+    assert table[2] == "0.1,lost,,,"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["scale"] == "metric (a known distance)"
+    assert summary["metric_scale"]["factor"] == found.factor
+    again = rescale(RescaleSettings(folder, known, "cpu"))
+    assert again.factor == pytest.approx(1, abs=1e-4)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["metric_scale"]["factor"] == pytest.approx(found.factor, rel=1e-3)
+    assert len(read_tum_trajectory(folder / "trajectory.tum").timestamps) == 5
+
+
+def test_what_cannot_be_scaled_stays_as_it_is(folder, capsys):
+    with pytest.raises(InputError, match="Nothing is known"):
+        rescale(RescaleSettings(folder, "", "cpu"))
+    with pytest.raises(InputError, match="no tag of DICT_5X5_50 was found"):
+        rescale(RescaleSettings(folder, "aruco:DICT_5X5_50:0.1", "cpu"))
+    assert json.loads((folder / "summary.json").read_text())["scale"] == "arbitrary"
+    assert main(["scale", str(folder), "--from", "0:1", "--device", "cpu"]) == 2
+    assert "is not understood" in capsys.readouterr().err
+
+
+def test_the_mesh_lies_on_the_planes_and_is_read_as_it_was_made(tmp_path):
+    folder = make_result(tmp_path)
+    path = remesh(RemeshSettings(folder, FINE, device="cpu"))
+    assert path == folder / "mesh.ply"
+    result = geogs.load_result(folder)
+    made, again = extract_mesh(fusion_views(result.keyframes), FINE), result.mesh
+    for name in ("vertices", "faces", "normals", "colours"):
+        np.testing.assert_array_equal(getattr(made, name), getattr(again, name))
+    z = (again.vertices[:, 2] - ORIGIN[2]) / UNIT
+    assert np.median(np.minimum(np.abs(z - WALL), np.abs(z - BLOCK))) < 0.01
+
+
+def test_the_command_takes_the_settings_of_the_run_where_none_are_given(tmp_path, capsys):
+    folder = make_result(tmp_path)
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("  voxel: null", "  voxel: 0.2"))
+    assert mesh_settings(folder).voxel == 0.2
+    assert main(["mesh", str(folder), "--mesh.detail", "0", "-o", str(tmp_path / "a.ply")]) == 0
+    assert "a.ply" in capsys.readouterr().out
+    assert main(["mesh", str(folder), "-o", str(tmp_path / "a.glb")]) == 2
+    assert "geogs export" in capsys.readouterr().err
+    (folder / "config.yaml").write_text("mesh: 3")
+    with pytest.raises(InputError, match=r"config.yaml is damaged"):
+        mesh_settings(folder)
+    assert mesh_settings(tmp_path / "nowhere") == MeshConfig()
+
+
+def test_the_page_shows_the_mesh_that_was_made_anew(tmp_path):
+    folder = make_result(tmp_path)
+    assert remesh(RemeshSettings(folder, FINE, device="cpu")) == folder / "mesh.ply"
+    assert not (folder / "report").exists()  # of a result without a page none is made
+    (folder / "summary.json").write_text('{"source": "planes", "mesh_faces": 7, "frames": 5}')
+    (folder / "report").mkdir()
+    remesh(RemeshSettings(folder, FINE, device="cpu"))
+    page = (folder / "report" / "index.html").read_text()
+    faces = f"{len(geogs.load_result(folder).mesh.faces):,}".replace(",", " ")
+    assert f"<dt>triangles</dt><dd>{faces}</dd>" in page
+    assert 'id="model-arrays"' in page
