@@ -77,6 +77,21 @@ def test_a_blurred_fill_is_found_though_it_moves(blur):
     assert not border.mask[:, 84:236].any()
 
 
+@pytest.mark.parametrize("rows", [15, 24, 36])
+def test_a_fill_like_the_scene_beside_it_is_found(rows):
+    images = []
+    grain = np.random.default_rng(0).normal(0, 25, (HEIGHT, WIDTH, 1))
+    for k, plain in enumerate(wall()):
+        image = np.clip(plain + np.roll(grain, 5 * k, axis=1), 0, 255).astype(np.uint8)
+        stretched = cv2.resize(image, (WIDTH, HEIGHT + 2 * rows))
+        fill = cv2.GaussianBlur(stretched, (0, 0), 8)
+        fill[rows : rows + HEIGHT] = image
+        images.append(fill)
+    border = find_border(images)
+    assert border is not None
+    assert border.sides == pytest.approx((rows, rows, 0, 0), abs=1)
+
+
 def test_what_is_outside_of_a_circle_is_found():
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     inside = np.hypot(u - WIDTH / 2, v - HEIGHT / 2) < 70

@@ -10,7 +10,7 @@ from itertools import product
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from geogs.io.sources.static_overlay import CHANGE, LEAST_IMAGES, usual_and_change
 from geogs.io.sources.undistort import resized_to
@@ -113,19 +113,21 @@ def _sides(
 ) -> tuple[int, int, int, int]:
     """Bars above, below, left and right, in pixels."""
     views = [_View.of(side, stack, change) for side in range(4)]
+    lines = []
     bars = [0, 0, 0, 0]
     # First with the other bars across the lines, then between these.
     for least in (_SOME_OF_LINE, _MOST_OF_LINE):
-        views = [
+        lines = [
             view.between(*(bars[2:] if side < 2 else bars[:2])) for side, view in enumerate(views)
         ]
-        bars = [view.bar(least) for view in views]
+        bars = [one.bar(least) or one.fill(least) for one in lines]
     # The second of two equal bars may be hard to see: a fill is like the scene beside it.
-    for side, view in enumerate(views):
+    for side, one in enumerate(lines):
         other = bars[side ^ 1]
         if not bars[side] and other > _FAR:
             rows = range(other - 2, other + 3)
-            bars[side] = next((r for r in rows if view.is_bar(r, _SOME_OF_LINE, _WEAK)), 0)
+            found = (r for r in rows if one.is_bar(r, _SOME_OF_LINE, _WEAK))
+            bars[side] = next(found, 0)
     return bars[0], bars[1], bars[2], bars[3]
 
 
@@ -153,20 +155,41 @@ class _View:
         sharp = np.stack([np.abs(cv2.Laplacian(image.mean(-1), cv2.CV_32F)) for image in stack])
         return cls(sharp, steps, change)
 
-    def between(self, left: int, right: int) -> "_View":
-        """The view without columns at its left and right."""
+    def between(self, left: int, right: int) -> "_Lines":
+        """The lines without columns at their left and right."""
         inner = slice(left, self.change.shape[1] - right)
-        return _View(*(one[..., inner] for one in (self.sharp, self.steps, self.change)))
+        still = (self.change[:, inner] < _STILL).mean(1)
+        return _Lines(_sections(self.sharp[..., inner]), _sections(self.steps[..., inner]), still)
+
+
+def _sections(values: Float32[np.ndarray, "n rows w"]) -> Float32[np.ndarray, "n rows sections"]:
+    """Means of ``_SECTIONS`` parts of rows."""
+    return np.stack([s.mean(-1) for s in np.array_split(values, _SECTIONS, axis=2)], -1)
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Rows from one side of the images, by sections."""
+
+    sharp: Float32[np.ndarray, "n h sections"]
+    """Detail of the images."""
+    steps: Float32[np.ndarray, "n h-2 sections"]
+    """Largest step of a colour from row k to row k + 2."""
+    still: Float64[np.ndarray, " h"]
+    """Part of a row that does not change in time."""
 
     def bar(self, least: float) -> int:
-        """Rows of the bar at the top; ``least`` of its edge must be seen."""
-        most = int(_MOST_OF_SIDE * len(self.change))
+        """Rows of the bar of one colour at the top; ``least`` of its edge must be seen."""
+        most = int(_MOST_OF_SIDE * len(self.still))
         return next((row for row in range(most, 1, -1) if self.is_bar(row, least)), 0)
 
     def is_bar(self, row: int, least: float, stand_out: float = _STAND_OUT) -> bool:
-        """Whether the rows before ``row`` are a bar."""
-        at = self._parts(row - 1, row)[:, 0]
-        beside = [self._parts(row - 6, row - 3), self._parts(row + 3, row + 6)]
+        """Whether an edge ends at ``row``, and the rows before it are still or blurred."""
+        at = self.steps[:, row - 1]
+        beside = [
+            self.steps[:, max(row - 6, 0) : max(row - 3, 0)],
+            self.steps[:, row + 3 : row + 6],
+        ]
         beside = np.maximum(*(b.mean(1) if b.size else np.zeros_like(at) for b in beside))
         is_edge, in_images = (
             at.mean(axis) > np.maximum(stand_out * beside.mean(axis), _LEAST_EDGE)
@@ -174,17 +197,33 @@ class _View:
         )
         if is_edge.mean() < least or in_images.mean() < min(least, _IN_IMAGES):
             return False
-        outside = slice(0, max(row - _FAR, 1))
-        if (self.change[outside] < _STILL).mean() > _STILL_PART:
-            return True
-        inside = slice(row + _FAR, max(len(self.change) // 2, row + 2 * _FAR))
-        details = (np.median(self.sharp[:, rows].mean((1, 2))) for rows in (outside, inside))
-        return row > 2 * _FAR and bool(next(details) < _BLURRED * next(details))
+        is_still = self.still[: max(row - _FAR, 1)].mean() > _STILL_PART
+        return bool(is_still) or self._is_blurred(row)
 
-    def _parts(self, first: int, stop: int) -> Float32[np.ndarray, "n rows sections"]:
-        """Mean steps in sections of some rows."""
-        steps = self.steps[:, max(first, 0) : max(stop, 0)]
-        return np.stack([s.mean(-1) for s in np.array_split(steps, _SECTIONS, axis=2)], -1)
+    def fill(self, least: float) -> int:
+        """Rows of a blurred fill at the top. It may be like the scene beside it, so its edge is
+        where all sections become sharp."""
+        most = int(_MOST_OF_SIDE * len(self.still))
+        found = next((row for row in range(most, 2 * _FAR, -1) if self._is_fill(row, least)), 0)
+        detail = self.sharp.mean((0, 2))
+        near = range(found - _FAR, found + 1)
+        return max(near, key=lambda row: detail[row] - detail[row - 2]) if found else 0
+
+    def _is_fill(self, row: int, least: float) -> bool:
+        before = self.sharp[:, row - _FAR - 2 : row - 2].mean(1)
+        behind = self.sharp[:, row + 2 : row + _FAR + 2].mean(1)
+        is_step = before < _BLURRED * behind
+        sections, images = (is_step.mean(axis) > 0.5 for axis in (0, 1))
+        is_edge = sections.mean() >= least and images.mean() >= min(least, _IN_IMAGES)
+        return bool(is_edge) and self._is_blurred(row)
+
+    def _is_blurred(self, row: int) -> bool:
+        """Whether the rows before ``row`` have little of the detail that those behind it have."""
+        inside = slice(row + _FAR, max(len(self.still) // 2, row + 2 * _FAR))
+        details = (
+            np.median(self.sharp[:, rows].mean((1, 2))) for rows in (slice(row - _FAR), inside)
+        )
+        return row > 2 * _FAR and bool(next(details) < _BLURRED * next(details))
 
 
 def _corners(
