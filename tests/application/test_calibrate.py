@@ -118,6 +118,7 @@ class Telling:
 
     def __init__(self, *lens: float) -> None:
         self.lens = lens
+        self.squeeze = 1.0
         self.asked: list[Unknowns] = []
         self.rectified: list[bool] = []
         """Whether rows were rectified before."""
@@ -129,7 +130,9 @@ class Telling:
             return SelfCalibration(camera, failure="it is a test")
         factor, *bend = self.lens
         found = camera.with_focal(factor * camera.fx)
-        return SelfCalibration(found, tuple(bend), 0.01, (0.01, 0.01), 12, 14)
+        return SelfCalibration(
+            found, tuple(bend), 0.01, (0.01, 0.01), 12, 14, squeeze=self.squeeze
+        )
 
 
 @pytest.mark.parametrize(
@@ -149,6 +152,11 @@ def test_the_lens_is_asked_once_of_rows_as_they_came(video, monkeypatch, given, 
     assert found.calibration.focal_deviation == pytest.approx(0.01)
     assert found.shutter.readout == (readout or 0.0)
     assert found.is_shutter_open is False
+    lens.squeeze = 0.75
+    squeezed = self_calibrated(before, Config()).calibration
+    assert squeezed.fx == found.calibration.fx
+    assert squeezed.fy == pytest.approx(0.75 * found.calibration.fy)
+    assert "fy / fx 0.750" in squeezed.origin
     lens.lens = ()
     failed = self_calibrated(before, Config())
     assert failed.calibration.fx == before.calibration.fx

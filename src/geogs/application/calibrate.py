@@ -197,6 +197,8 @@ def refined(
     deviation = found.deviation * focal
     was = "was assumed" if calibration.is_guess else f"says {calibration.fx:.1f}"
     origin = f"refined from the video: {focal:.1f} +- {deviation:.1f} pixels"
+    if found.squeeze != 1:
+        origin += f", fy / fx {found.squeeze:.3f}: the pixels are no squares"
     distortion = calibration.distortion
     if found.distortion is not None:
         distortion = (*found.distortion, 0.0, 0.0)
@@ -207,7 +209,7 @@ def refined(
     return replace(
         calibration,
         fx=focal,
-        fy=calibration.fy * factor,
+        fy=calibration.fy * factor * found.squeeze,
         distortion=distortion,
         origin=f"{origin} ({calibration.origin} {was})",
         is_guess=False,

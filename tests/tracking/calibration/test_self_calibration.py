@@ -50,10 +50,34 @@ def test_finds_the_focal_length_of_a_rendered_room(factor):
     assert error < 2.5 * found.deviation
     assert LEAST_DEVIATION <= found.deviation < 0.05
     assert found.camera.fx == pytest.approx(found.camera.fy)
+    assert found.squeeze == 1
     assert (found.camera.cx, found.camera.cy) == (CAMERA.cx, CAMERA.cy)
     assert found.distortion is found.deviations is None
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
+
+
+def tilted(T_wc: np.ndarray, angle: float) -> np.ndarray:
+    """A pose that looks up by an angle in radians: a level camera does not tell the aspect."""
+    turn = np.eye(4)
+    turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return T_wc @ turn
+
+
+@pytest.mark.parametrize("wide", [0.75, pytest.param(1.1, marks=pytest.mark.long)])
+def test_pixels_that_are_no_squares_are_found(wide):
+    width = round(wide * CAMERA.width)
+    path = [tilted(T, 0.25 * np.sin(0.5 * k)) for k, T in enumerate(swinging(22))]
+    squeezed = [
+        replace(frame, image=cv2.resize(frame.image, (width, CAMERA.height)))
+        for frame in frames(path)
+    ]
+    truth = CAMERA.resized(width, CAMERA.height)
+    guess = replace(truth, fx=1.1 * truth.fx, fy=1.1 * truth.fx)
+    found = self_calibrate(squeezed, guess)
+    assert found.failure is None
+    assert found.camera.fx == pytest.approx(truth.fx, rel=0.015)
+    assert found.squeeze == pytest.approx(truth.fy / truth.fx, rel=0.01)
 
 
 def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkeypatch):

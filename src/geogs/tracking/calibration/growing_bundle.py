@@ -3,9 +3,11 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Float
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
@@ -14,6 +16,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import relative_motion
 from geogs.bundle.row_motions import RowMotions, fitted_twists
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.unknowns import OpenRows, Unknowns
@@ -31,6 +34,15 @@ _TOGETHER = 16
 PATIENT, LEAST_DECREASE = replace(OPTIONS, iterations=60), 1e-6
 """Options for many small steps: for a rotating camera focal length, distortion and depths lie in a
 flat valley, along which each step gains little; an early stop would be near the start."""
+
+
+_SQUEEZE, _MOST_SQUEEZE = 0.03, 0.8
+"""Least and largest change of log fy / fx that is looked for."""
+_SAME_ASPECT = 0.004
+"""Change of log fy / fx that needs no further adjustment once the pixels are no squares."""
+_BETTER = 0.7
+"""Largest cost with another aspect relative to that with square pixels; chosen on synthetic clips
+(docs/notebook/calibration.md)."""
 
 
 @dataclass
@@ -72,6 +84,7 @@ class GrowingBundle:
         self._depth, self._information = map(list, zip(*each, strict=True))
         self._edges: dict[tuple[int, int], _Edge] = {}
         self.result: SharedResult | None = None
+        self._is_squeezed = False
         self.residual = math.inf
         """Median residual of the matches, in their own deviations, as last adjusted."""
 
@@ -151,13 +164,8 @@ class GrowingBundle:
 
     def adjust(self) -> bool:
         """Solve for all unknowns and update the state; False if that fails."""
-        unknowns = self._unknowns
-        problem = self.problem()
-        problem = replace(problem, by_rows=self._by_rows(problem))
-        rolls = None if problem.by_rows is None else unknowns.readout is None
-        pixels = self.grid.pixels.cpu()
-        block = LensBlock(self.lens, pixels, unknowns.focal, unknowns.radial, self.readout, rolls)
-        result = solve_shared(problem, block, PATIENT, LEAST_DECREASE)
+        problem = self._whole_problem()
+        result = self._solved(problem, self.lens)
         if not result.finite:
             return False
         self.result = result
@@ -171,6 +179,43 @@ class GrowingBundle:
         self._depth = list(grid_fields(self.grid).fill(depth, information))
         self._normalise()
         return True
+
+    def find_aspect(self) -> bool:
+        """Change the aspect of the lens where that explains the matches much better; return whether
+        it did. The pixels of a video may be no squares, and its file need not say so."""
+        assert self.result is not None
+        problem = self._whole_problem()
+
+        @cache
+        def cost(log_aspect: float) -> float:
+            result = self._solved(problem, self._squeezed(log_aspect))
+            return result.cost if result.finite else math.inf
+
+        least = _SAME_ASPECT if self._is_squeezed else _SQUEEZE
+        if min(cost(-least), cost(least)) >= self.result.cost:
+            return False
+        bounds = (-_MOST_SQUEEZE, _MOST_SQUEEZE)
+        best = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+        if abs(best.x) < least or not (self._is_squeezed or best.fun < _BETTER * self.result.cost):
+            return False
+        self.lens = self._squeezed(float(best.x))
+        self._is_squeezed = True
+        return True
+
+    def _squeezed(self, log_aspect: float) -> Camera:
+        """Return the lens with fy / fx times ``exp(log_aspect)``."""
+        return replace(self.lens, fy=self.lens.fy * math.exp(log_aspect))
+
+    def _whole_problem(self) -> BundleProblem:
+        problem = self.problem()
+        return replace(problem, by_rows=self._by_rows(problem))
+
+    def _solved(self, problem: BundleProblem, lens: Camera) -> SharedResult:
+        unknowns = self._unknowns
+        rolls = None if problem.by_rows is None else unknowns.readout is None
+        pixels = self.grid.pixels.cpu()
+        block = LensBlock(lens, pixels, unknowns.focal, unknowns.radial, self.readout, rolls)
+        return solve_shared(problem, block, PATIENT, LEAST_DECREASE)
 
     def _by_rows(self, problem: BundleProblem) -> Float[Tensor, "e p 2"] | None:
         """Return the shift of all matches per second of readout, by the motions of views in the

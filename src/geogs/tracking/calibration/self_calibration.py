@@ -52,6 +52,8 @@ LEAST_DEVIATION = 0.002
 """Least deviation of the focal length, relative, and of k1 and k2, however many matches agree."""
 MOST_BEND = 4.0
 """Prior deviations of k1 and k2 beyond which an estimate is rejected as no real lens."""
+_ASPECTS = 3
+"""Most changes of the aspect before more views are added."""
 UNRELIABLE = 0.1
 """Relative deviation above which the focal length is rejected and the guess, which may be as good,
 is kept."""
@@ -64,7 +66,8 @@ class SelfCalibration:
     """Camera estimated from a video."""
 
     camera: Camera
-    """Camera of the working image; the guess where there is a ``failure``."""
+    """Camera of the working image, with the aspect of the guess; the guess where there is a
+    ``failure``."""
     distortion: tuple[float, float] | None = None
     """OpenCV's k1 and k2; None where they were not estimated, or the video does not show any
     distortion."""
@@ -79,6 +82,9 @@ class SelfCalibration:
     """Reason of a failure, such as "the camera only turns", for the middle of a sentence."""
     readout: FoundReadout = field(default_factory=FoundReadout)
     """Readout of its shutter, if it was estimated."""
+    squeeze: float = 1.0
+    """Factor on fy over fx that the matches want: other than 1 where the pixels are no squares
+    though nothing says so."""
 
 
 @on_one_torch_thread
@@ -94,8 +100,9 @@ def self_calibrate(
     """Estimate the ``unknowns`` (default: the focal length) of the camera that took ``frames``,
     whose rows are not rectified.
 
-    ``camera`` is that of the frames. Its aspect and principal point are assumed exact; its focal
-    length, if unknown, is one of several initial values. Flow is measured by the operator without a
+    ``camera`` is that of the frames. Its principal point is assumed exact; its focal length, if
+    unknown, is one of several initial values, and its aspect changes where another explains the
+    matches much better. Flow is measured by the operator without a
     network. Stretches of the video are tried until one succeeds. Lens and readout are estimated
     together, as shear and stretch by rows would be mistaken for another lens.
     ``report`` is called with the fraction done; its exceptions are passed on. Pixels outside a
@@ -135,6 +142,7 @@ def self_calibrate(
             found.keyframes,
             gatherer.frames,
             readout=found.readout or FoundReadout(),
+            squeeze=round(lens.fy / lens.fx * small.fx / small.fy, 4),
         )
     # That no camera explains a stretch is more important than what the others lack.
     failure = min(failures, key=lambda failure: failure != Degeneracy.UNEXPLAINED.value)
@@ -227,10 +235,12 @@ class Stretch:
                 self._tick()
                 if not bundle.place(view):
                     return found
-            # Matches are searched again from their positions after the first adjustment.
-            for fine in (self.grid.camera.long_edge <= SMALL_IMAGE, True):
-                bundle.measure(fine, self._tick)
-                if not bundle.adjust():
+            if not self._adjust(bundle):
+                return found
+            for _ in range(_ASPECTS):
+                if not (self.unknowns.focal and bundle.find_aspect()):
+                    break
+                if not self._adjust(bundle):
                     return found
             found = estimate(bundle, self.unknowns)
             self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
@@ -238,6 +248,15 @@ class Stretch:
                 return found
             if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
                 return found
+
+    def _adjust(self, bundle: GrowingBundle) -> bool:
+        """Match and adjust all views; False if that fails. Matches are searched again from their
+        positions after the first adjustment."""
+        for fine in (self.grid.camera.long_edge <= SMALL_IMAGE, True):
+            bundle.measure(fine, self._tick)
+            if not bundle.adjust():
+                return False
+        return True
 
     def _start(self) -> Start | Degeneracy:
         """Return the first views with parallax and depth, located with the best candidate."""
