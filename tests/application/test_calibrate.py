@@ -130,9 +130,7 @@ class Telling:
             return SelfCalibration(camera, failure="it is a test")
         factor, *bend = self.lens
         found = camera.with_focal(factor * camera.fx)
-        return SelfCalibration(
-            found, tuple(bend), 0.01, (0.01, 0.01), 12, 14, squeeze=self.squeeze
-        )
+        return SelfCalibration(found, tuple(bend), 0.01, (0.01, 0.01), 12, 14, squeeze=self.squeeze)
 
 
 @pytest.mark.parametrize(
