@@ -117,10 +117,9 @@ def read_replica_trajectory(path: Path) -> Trajectory:
     """
     rows = read_rows(path, columns=(16, 12), layout="a 4x4 matrix a row")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3] = rows[:, :12].reshape(-1, 3, 4)
-    valid = np.isfinite(rows).all(axis=1) & is_rigid(T_wc)
+    T_wc[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
     seconds = np.arange(len(rows)) / FRAMES_PER_SECOND
-    return matrix_trajectory(path, seconds, T_wc, valid)
+    return matrix_trajectory(path, seconds, T_wc, is_rigid(T_wc))
 
 
 def read_seven_scenes_poses(folder: Path) -> Trajectory:
@@ -199,11 +198,13 @@ def _check_quaternions(
 
 
 def is_rigid(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
-    """Return which matrices are finite, with a rotation to 1e-2."""
+    """Return which matrices are finite, with a rotation to 1e-2 and a last row 0 0 0 1 to 1e-6."""
     finite = np.isfinite(T).all(axis=(1, 2))
     rotation = np.where(finite[:, None, None], T[:, :3, :3], 0.0)
     error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    return finite & (error < 1e-2) & (np.linalg.det(rotation) > 0)
+    last_row = np.where(finite[:, None], T[:, 3], 0.0)
+    is_affine = np.abs(last_row - [0, 0, 0, 1]).max(axis=1) < 1e-6
+    return finite & is_affine & (error < 1e-2) & (np.linalg.det(rotation) > 0)
 
 
 def says_pose(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
@@ -226,7 +227,7 @@ def matrix_trajectory(
     if valid.sum() < 0.5 * says_pose(T_wc).sum():
         raise InputError(
             f"{path}: the matrices are no rigid motions; expected 4x4 camera-to-world matrices, "
-            f"row by row."
+            f"row by row, the last row 0 0 0 1."
         )
     T_wc = _kept(path, T_wc, valid)
     return Trajectory(seconds[valid], T_wc, np.ones(len(T_wc), dtype=bool))
@@ -239,5 +240,7 @@ def _kept(
     if dropped == len(valid):
         raise InputError(f"{path} holds no valid pose: all {dropped} rows are NaN, inf or zero.")
     if dropped:
-        _log.warning("%s: dropped %d of %d poses (NaN, inf or zero).", path, dropped, len(valid))
+        _log.warning(
+            "%s: dropped %d of %d poses (not finite, or not rigid).", path, dropped, len(valid)
+        )
     return rows[valid]

@@ -1,6 +1,7 @@
 """A result that was written can be used again."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -189,3 +190,58 @@ def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, result):
     with pytest.raises(InputError, match=r"summary.json does not exist"):
         _ = result.summary
     assert result.mesh is None
+
+
+def changed_map(folder, change_views=None, **tensors):
+    """Write the map of a result anew, with other tensors or other numbers of its views."""
+    path = folder / "map.safetensors"
+    with safe_open(path, "pt") as file:
+        header = file.metadata()
+    said = json.loads(header["metadata"])
+    if change_views is not None:
+        change_views(said["views"])
+    save_file({**load_file(path), **tensors}, path, {**header, "metadata": json.dumps(said)})
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.float64, torch.float16, torch.complex64, torch.uint16, torch.int8, torch.bool]
+)
+def test_tensors_of_another_type_are_refused(tmp_path, result, dtype):
+    for name, tensor in load_file(result.folder / "map.safetensors").items():
+        if tensor.dtype is not dtype:
+            make_result(tmp_path)
+            changed_map(tmp_path, **{name: torch.zeros(tensor.shape, dtype=dtype)})
+            with pytest.raises(InputError, match=r"not of float32|was it changed"):
+                geogs.load_result(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["camera", "render_camera"])
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"fx": 1e-300}, {"fy": 1e300}, {"cx": 1e200}, {"cy": math.nan}, {"fx": -50.0},
+        {"width": 16384, "height": 16384}, {"width": 1 << 40}, {"width": 161, "height": 121},
+    ],
+)  # fmt: skip
+def test_cameras_that_no_keyframe_has_are_refused(tmp_path, name, numbers):
+    make_result(tmp_path)
+    changed_map(tmp_path, lambda views: views[name].update(numbers))
+    with pytest.raises(InputError, match="was it changed"):
+        geogs.load_result(tmp_path)
+
+
+@pytest.mark.parametrize("with_images", [True, False])
+def test_no_map_alone_asks_for_huge_depth_maps(tmp_path, with_images):
+    """Neither without images, nor where those that it names are not there."""
+    make_result(tmp_path, with_images)
+    for path in (tmp_path / "keyframes").glob("*.jpg"):
+        path.unlink()
+    huge = {"width": 16384, "height": 16384}
+
+    def change(views):
+        views["camera"].update(huge)
+        views["render_camera"].update(huge, fx=9000.0, fy=9000.0)
+
+    changed_map(tmp_path, change)
+    with pytest.raises(InputError, match="far larger than any"):
+        geogs.load_result(tmp_path)

@@ -18,6 +18,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.geometry.lie import se3_inverse
+from geogs.io.pictures import upright_size
 from geogs.io.pose_files import read_frame_poses
 from geogs.io.writers.keyframe_folder import (
     image_path,
@@ -38,6 +39,9 @@ from geogs.on_demand import OnDemand
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
+
+_MOST_UNSEEN = 1 << 24
+"""Most pixels of a depth map in a result that has no images."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -193,7 +197,25 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
         OutputError: a command was interrupted while replacing it, and that cannot be completed.
     """
     folder = result_folder(folder)
-    return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
+    result = SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
+    _check_render_size(result)
+    return result
+
+
+def _check_render_size(result: SavedResult) -> None:
+    """Raise InputError where the first image does not confirm the size that the map states.
+
+    That size bounds that of depth maps. Where there is no image, they have a fixed bound.
+    """
+    path = image_path(result.folder, int(next(iter(result.views.keyframe_id), 0)))
+    size = upright_size(path) if result.views.has_images else None
+    depth = result.depth_camera
+    if size is None and depth.width * depth.height > _MOST_UNSEEN:
+        raise InputError(
+            f"{result.folder} asks for depth maps far larger than any; was it changed?"
+        )
+    if size not in (None, (result.camera.width, result.camera.height)):
+        raise InputError(f"{path} is of another size than the result says; was it changed?")
 
 
 def result_folder(folder: str | Path) -> Path:

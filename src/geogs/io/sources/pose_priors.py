@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
-from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.pose_files import is_rigid, read_tum_trajectory
 from geogs.io.sources.account import Account
 from geogs.io.sources.reader import RecordingInfo
 from geogs.types import MeasuredPose, Trajectory
@@ -50,12 +50,9 @@ def measured_pose(T_wc: Float64[np.ndarray, "4 4"]) -> MeasuredPose:
 def rigid_pose(T_wc: Float64[np.ndarray, "4 4"], quarter_turns: int = 0) -> MeasuredPose | None:
     """A pose from camera to world, OpenCV axes, metres, with the nearest rotation; none where it is
     no rigid motion. Its images were turned upright by clockwise ``quarter_turns``."""
-    R = T_wc[:3, :3]
-    if not np.isfinite(T_wc).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.02:
+    if not is_rigid(T_wc[None])[0]:
         return None
-    u, _, vt = np.linalg.svd(R)
-    if np.linalg.det(u @ vt) < 0:
-        return None
+    u, _, vt = np.linalg.svd(T_wc[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3] = u @ vt
     rigid[:3, 3] = T_wc[:3, 3]

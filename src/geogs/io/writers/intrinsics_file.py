@@ -1,7 +1,6 @@
 """``intrinsics.json``: the camera of the working images, that of the source, and its shutter."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +84,10 @@ def camera_of(entry: Any) -> Camera:
     """
     fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
     width, height = whole_number(entry["width"]), whole_number(entry["height"])
-    if not (all(map(math.isfinite, (fx, fy, cx, cy))) and min(fx, fy) > 0):
-        raise ValueError("no camera has such numbers")
     if not (min(width, height) >= 1 and width * height <= _MOST_PIXELS):
         raise ValueError("no image has such a size")
+    edge = max(width, height)
+    has_view = all(1e-3 <= focal / edge <= 1e4 for focal in (fx, fy))
+    if not (has_view and all(abs(centre) <= 1e3 * edge for centre in (cx, cy))):
+        raise ValueError("no camera has such numbers")
     return Camera(fx, fy, cx, cy, width, height)

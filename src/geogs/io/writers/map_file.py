@@ -28,6 +28,10 @@ FORMAT_VERSION = 2
 _SHAPES = {"position": (3,), "quaternion": (4,), "scale": (2,), "opacity": ()}
 _OWN = {"position": "map_position", "scale": "map_scale"}
 """Names of tensors in the map's own frame, where that is not the world's."""
+_OF_KEYFRAMES = {
+    "id": torch.int64, "time": torch.float64, "T_cw": torch.float64, "has_mask": torch.bool
+}  # fmt: skip
+"""Tensors of the views by name, and their types; all others are float32."""
 _NONE = torch.zeros(0, 0, 0)
 
 
@@ -91,9 +95,12 @@ def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFi
     is_own = "position" not in tensors
     parts = {n: tensors.get(_OWN.get(n, n) if is_own else n, _NONE) for n in _SHAPES}
     for name, shape in _SHAPES.items():
-        if parts[name].shape != (len(parts["position"]), *shape):
-            raise InputError(f"{path} is no map of geogs: its {name} is missing or misshapen.")
-    disks = MapSnapshot(**{name: part.to(device).float() for name, part in parts.items()})
+        part = parts[name]
+        if part.shape != (len(parts["position"]), *shape) or part.dtype is not torch.float32:
+            raise InputError(
+                f"{path} is no map of geogs: its {name} is missing or misshapen, or not of float32."
+            )
+    disks = MapSnapshot(**{name: part.to(device) for name, part in parts.items()})
     if is_own:
         try:
             disks = disks.in_world(*_frame(metadata["views"]))
@@ -231,8 +238,10 @@ def _views(file: MapFile) -> MapViews:
     scale = tensors.get("map_scale", disks.scale).to(disks.scale)
     if position.shape != disks.position.shape or scale.shape != disks.scale.shape:
         raise ValueError("its disks differ in number")
-    names = ("id", "time", "T_cw", "has_mask")
-    ids, times, T_cw, masked = (tensors[f"keyframe_{name}"] for name in names)
+    of_keyframes = {name: tensors[f"keyframe_{name}"] for name in _OF_KEYFRAMES}
+    if any(of_keyframes[name].dtype is not dtype for name, dtype in _OF_KEYFRAMES.items()):
+        raise ValueError("its keyframes are of another type")
+    ids, times, T_cw, masked = of_keyframes.values()
     if not times.shape == masked.shape == ids.shape or T_cw.shape != (*ids.shape, 4, 4):
         raise ValueError("its keyframes differ in number")
     origin, unit = _frame(said)
@@ -241,18 +250,22 @@ def _views(file: MapFile) -> MapViews:
     reach = float(said.get("plane_reach", 2 * spread))
     if not (holds((RIGID,), T_cw) and holds((), times) and holds((), reach)):
         raise ValueError("a pose is none, or a number is not finite")
+    camera = camera_of(said["camera"])
+    render_camera = camera_of(said["render_camera"])
+    if render_camera.long_edge > 2 * camera.long_edge:
+        raise ValueError("its depth maps are larger than its images")
     return MapViews(
-        camera=camera_of(said["camera"]),
-        render_camera=camera_of(said["render_camera"]),
+        camera=camera,
+        render_camera=render_camera,
         min_alpha=float(said["min_alpha"]),
         max_spread=spread,
         plane_reach=reach,
         origin=origin,
         unit=unit,
         disks=MapSnapshot(position, disks.quaternion, scale, disks.opacity),
-        keyframe_id=ids.long().numpy(),
-        timestamp=times.double().numpy(),
-        T_cw=T_cw.double().numpy(),
-        has_mask=masked.bool().numpy(),
+        keyframe_id=ids.numpy(),
+        timestamp=times.numpy(),
+        T_cw=T_cw.numpy(),
+        has_mask=masked.numpy(),
         has_images=bool(said["has_images"]),
     )

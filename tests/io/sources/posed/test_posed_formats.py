@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 
@@ -335,6 +336,39 @@ def test_scannet_lost_frames(room, tmp_path):
     kept = [0, 1, 3, 4, 6, 7, 8, 9, 10]
     np.testing.assert_allclose(source.T_cw, room.T_cw[kept], atol=1e-9)
     np.testing.assert_allclose(source.timestamps, np.array(kept) / 30)
+
+
+def change_matrices(folder, numbers, last_row):
+    """Give the poses of these frames another last row, in whatever files they are."""
+    for file in [*folder.glob("*.pose.txt"), *folder.glob("pose/*.txt")]:
+        if int(re.search(r"\d+", file.name)[0]) in numbers:
+            np.savetxt(file, [*np.loadtxt(file)[:3], last_row])
+    if (table := folder / "traj.txt").exists():
+        rows = np.loadtxt(table)
+        rows[numbers, 12:] = last_row
+        np.savetxt(table, rows)
+    if (file := folder / "transforms.json").exists():
+        document = json.loads(file.read_text())
+        for frame in document["frames"]:
+            if int(re.search(r"\d+", frame["file_path"])[0]) - 1 in numbers:
+                frame["transform_matrix"][3] = last_row
+        file.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("last", [(0.0, 0.0), (0.0, 2.0), (0.1, 1.0), (0.0, -1.0)])
+@pytest.mark.parametrize(
+    "write", [write_seven_scenes, write_scannet, write_replica, write_nerfstudio]
+)
+def test_a_pose_whose_last_row_is_not_0_0_0_1_is_none(write, last, room, tmp_path):
+    last_row = [0.0, 0.0, *last]
+    write(room, tmp_path)
+    change_matrices(tmp_path, [2, 5], last_row)
+    source = open_posed_source(tmp_path, NATIVE)
+    kept = [0, 1, 3, 4, 6, 7, 8, 9, 10]
+    np.testing.assert_allclose(source.T_cw, room.T_cw[kept], atol=1e-9)
+    change_matrices(tmp_path, list(range(11)), last_row)
+    with pytest.raises(InputError):
+        open_posed_source(tmp_path, NATIVE)
 
 
 def test_mirrored_poses_are_refused(room, tmp_path):

@@ -129,7 +129,7 @@ def _pose(
     if rows.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"transform_matrix of shape {rows.shape}")
     T_wc = np.eye(4)
-    T_wc[:3] = rows[:3]
+    T_wc[: len(rows)] = rows
     T_wc[:3, 3] /= scale
     T_cw = _inverse(to_world @ T_wc @ OPENCV_FROM_OPENGL)
     return np.full((4, 4), np.nan) if T_cw is None else T_cw

@@ -111,8 +111,8 @@ def _refuse(posed: PosedSet, rotation: Float64[np.ndarray, "n 3 3"]) -> None:
             f"swapped without turning a sign; negate one of the swapped axes."
         )
     raise InputError(
-        f"{posed.name}: the upper left 3x3 of the poses is no rotation; scale the translations "
-        f"only, and give each matrix row by row."
+        f"{posed.name}: the poses are no rigid motions; scale the translations only, give each "
+        f"matrix row by row, and 0 0 0 1 as its last row."
     )
 
 
