@@ -7,6 +7,7 @@ import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -221,3 +222,50 @@ def test_the_list_names_each_once_and_encrypted(capsys):
     assert find_sequence("tum/fr1_desk").folder == "rgbd_dataset_freiburg1_desk"
     assert main(["download", "tum/fr1_dsk", "x"]) == 2
     assert "did you mean tum/fr1_desk?" in capsys.readouterr().err
+
+
+def zip_with(method: int, path: Path, content: bytes) -> None:
+    with zipfile.ZipFile(path, "w", method) as packed:
+        packed.writestr("a/b.bin", content)
+
+
+def tar_with(form: str, path: Path, content: bytes) -> None:
+    with tarfile.open(path, form) as tar:
+        member = tarfile.TarInfo("a/b.bin")
+        member.size = len(content)
+        tar.addfile(member, io.BytesIO(content))
+
+
+PACKED: dict[str, Callable[[Path, bytes], None]] = {
+    **{
+        f"zip-{method}": partial(zip_with, method)
+        for method in (
+            zipfile.ZIP_STORED,
+            zipfile.ZIP_DEFLATED,
+            zipfile.ZIP_BZIP2,
+            zipfile.ZIP_LZMA,
+        )
+    },
+    **{f"tar-{form}": partial(tar_with, form) for form in ("w:", "w:gz", "w:bz2", "w:xz")},
+}
+
+
+@pytest.mark.parametrize("kind", PACKED)
+def test_an_archive_damaged_anywhere_is_unpacked_or_refused_in_a_sentence(kind, tmp_path):
+    """The decompressors raise errors of their own, each another one."""
+    archive = tmp_path / "archive"
+    PACKED[kind](archive, np.random.default_rng(0).bytes(3000))
+    good = archive.read_bytes()
+    refused = []
+    for place in np.linspace(0, len(good) - 4, 60).astype(int).tolist():
+        for value in (b"\xff\xff\xff\xff", b"\0\0\0\0"):
+            archive.write_bytes(good[:place] + value + good[place + 4 :])
+            try:
+                unpack(archive, tmp_path / f"{place}-{value[0]}")
+            except InputError as error:
+                refused.append(str(error))
+    assert len(refused) >= 4
+    assert {said.rpartition("; ")[2] for said in refused} <= {
+        "delete it and fetch it again.",
+        "it is not used.",
+    }

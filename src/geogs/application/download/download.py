@@ -8,17 +8,17 @@ import tarfile
 import urllib.error
 import urllib.request
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, TypeVar
 
 from geogs.application.download.sequences import PublicSequence
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed
-from geogs.errors import InputError, OutputError
+from geogs.documents import in_short
+from geogs.errors import GeogsError, InputError, OutputError
 
 
 def download(sequence: PublicSequence, into: Path, progress: RunProgress | None = None) -> Path:
@@ -57,6 +57,7 @@ def download(sequence: PublicSequence, into: Path, progress: RunProgress | None 
 _MIN_LIMIT = 1 << 30
 """Unpacked size in bytes that is always allowed."""
 
+T = TypeVar("T")
 Member = tuple[str, int, Callable[[], IO[bytes] | None]]
 """Name, size in bytes, and opener of a plain file in an archive."""
 
@@ -72,18 +73,29 @@ def unpack(archive: Path, folder: Path) -> None:
     most = max(50 * archive.stat().st_size, _MIN_LIMIT)
     try:
         folder.mkdir(parents=True)
-        for name, size, opened in _members(archive):
+        for name, size, opened in _guarded(_members(archive), archive):
             most -= size
             if most < 0:
                 raise InputError(f"{archive} would unpack to far more than images; it is not used.")
-            _write(folder / _inside(name, archive), opened)
-    except (tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
-        raise InputError(f"{archive} is damaged ({error}); delete it and fetch it again.") from None
+            path = folder / _inside(name, archive)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("xb") as file:
+                file.writelines(_guarded(_chunks(opened), archive))
     except OSError as error:
-        if error.strerror is None:  # gzip's error for a damaged file
-            raise InputError(f"{archive} is damaged; delete it and fetch it again.") from None
         raise OutputError(f"{folder} cannot be written ({error.strerror}).") from None
     _lift(folder)
+
+
+def _guarded(read: Iterator[T], archive: Path) -> Iterator[T]:
+    """What is read from an archive. Raises InputError for any error in reading it."""
+    try:
+        yield from read
+    except (GeogsError, MemoryError):
+        raise
+    except Exception as error:  # of tarfile, of zipfile, and of all that decompress for them
+        raise InputError(
+            f"{archive} is damaged ({in_short(error)}); delete it and fetch it again."
+        ) from None
 
 
 def _members(archive: Path) -> Iterator[Member]:
@@ -114,12 +126,11 @@ def _inside(name: str, archive: Path) -> PurePosixPath:
     return path
 
 
-def _write(path: Path, opened: Callable[[], IO[bytes] | None]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _chunks(opened: Callable[[], IO[bytes] | None]) -> Iterator[bytes]:
     stream = opened()
     assert stream is not None, "of a plain file"
-    with closing(stream), path.open("xb") as file:
-        shutil.copyfileobj(stream, file, 1 << 20)
+    with closing(stream):
+        yield from iter(partial(stream.read, 1 << 20), b"")
 
 
 def _lift(folder: Path) -> None:
