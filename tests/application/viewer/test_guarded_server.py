@@ -1,9 +1,12 @@
 """Who may look on: those who know the address, from no other page; what strangers wrote is text."""
 
 import json
+import socket
+import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -38,6 +41,57 @@ def test_the_page_is_had_by_its_whole_address_alone(window):
     for other in (f"{place}/", f"{place}/{token[:-1]}/", f"{place}/x/{token}/", f"{place}//"):
         assert status(other) == 403
     assert status(window.address, Origin="http://evil.example") == 403
+
+
+def first_line(port: int, request: bytes) -> bytes:
+    """First line of the answer to a request; empty where the connection is closed instead."""
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as connection:
+        connection.sendall(request)
+        try:
+            return connection.makefile("rb").readline().rstrip()
+        except ConnectionError:
+            return b""
+
+
+def test_requests_that_cannot_be_understood_are_refused_without_a_traceback(window, caplog):
+    port = window._server.get_port()
+    token = window.address.rstrip("/").rpartition("/")[2].encode()
+    own = b"GET /" + token
+    hosts = b"Host: a\r\nHost: b\r\n"
+    for start, headers in (
+        (b"GET /\xff\xfe/", b""),
+        (b"GET /\xc3\xa9/", b""),
+        (b"GET /%ff%fe/", b""),
+        (own + b"/\xff", b""),
+        (own + b"/" + b"a" * 3000, b""),
+        (own + b"/", hosts + b"Origin: http://a\r\n"),
+        (b"GET /x/", b"Origin: http://[x\r\n"),
+        (b"GET /x/", b"Origin: http://a\r\nOrigin: http://b\r\n"),
+    ):
+        request = start + b" HTTP/1.1\r\n" + headers + b"\r\n"
+        assert first_line(port, request)[:12] in (b"", b"HTTP/1.1 400", b"HTTP/1.1 403")
+    assert not [record for record in caplog.records if record.exc_info]
+    assert status(window.address) == 200
+
+
+@pytest.mark.parametrize("path", ["/\udcff\udcfe/", "/secret/\ud800", "", "/é/"])
+def test_a_path_of_any_letters_is_no_error_of_the_server(monkeypatch, path):
+    """Versions of websockets differ in the letters that they let through."""
+    from geogs.application.viewer import browser_window
+
+    kept = []
+    server = SimpleNamespace(serve=lambda *_, process_request: kept.append(process_request))
+    modules = {"websockets": ModuleType("websockets"), "websockets.asyncio": ModuleType("asyncio")}
+    modules["websockets.asyncio"].server = server
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    guarded = object.__new__(browser_window.GuardedServer)
+    guarded._token = "secret"
+    with guarded._guarded():
+        server.serve(process_request=lambda connection, request: request.path.encode())
+    connection = SimpleNamespace(respond=lambda status, text: status)
+    request = SimpleNamespace(path=path, headers={})
+    assert kept[0](connection, request) in (400, 403)
 
 
 def test_a_socket_of_another_origin_or_without_the_token_is_refused(window):

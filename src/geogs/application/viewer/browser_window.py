@@ -66,7 +66,10 @@ class GuardedServer:
             self._is_guarded = process_request is not None
 
             def check(connection: Any, request: Any) -> Any:
-                return self._checked(connection, request, process_request)
+                try:
+                    return self._checked(connection, request, process_request)
+                except Exception:  # a path or headers that cannot be parsed, here or by viser
+                    return connection.respond(400, "The request cannot be understood.\n")
 
             return serve(*args, process_request=check, **more)
 
