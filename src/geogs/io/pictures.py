@@ -162,7 +162,12 @@ def _claims_too_many_pixels(data: np.ndarray) -> bool:
         pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)
     except Exception:  # left to the decoder
         return False
-    return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
+    return pixels > most_pixels(len(data))
+
+
+def most_pixels(size: int) -> int:
+    """Most pixels that an image of a file of ``size`` bytes can have."""
+    return max(_HARMLESS, _PIXELS_A_BYTE * size)
 
 
 def _without_turn(data: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import math
 import struct
 from dataclasses import replace
 from fractions import Fraction
@@ -12,8 +13,9 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.io.sources import video_limits
 from geogs.io.sources.formats import video_file
-from geogs.io.sources.formats.video_file import turn_upright
+from geogs.io.sources.formats.video_file import VideoFile, turn_upright
 from geogs.io.sources.sniff import open_source
 from io_samples import gradient_image, write_video
 
@@ -206,3 +208,54 @@ def test_a_resolution_that_changes_in_mid_stream(tmp_path, caplog, size, scaled)
     for k, frame in enumerate(frames):
         assert np.abs(frame.image.astype(int) - gradient_image(k % 5)).mean() < 6
     assert source.place.recordings[0].scaled == scaled
+
+
+def write_gif(path, width, height, images=3):
+    """Black images, of a few bytes each whatever their size."""
+    data = b"GIF89a" + struct.pack("<HH", width, height) + b"\x80\0\0\0\0\0\xff\xff\xff"
+    image = b"\x21\xf9\x04\x04\x05\0\0\0," + struct.pack("<4H", 0, 0, 2, 2)
+    path.write_bytes(data + images * (image + b"\0\x02\x03\x44\x02\x05\0") + b";")
+
+
+def write_y4m(path, width, height):
+    path.write_bytes(f"YUV4MPEG2 W{width} H{height} F30:1 C420\nFRAME\n".encode() + bytes(500))
+
+
+@pytest.mark.parametrize(("write", "suffix"), [(write_gif, "gif"), (write_y4m, "y4m")])
+@pytest.mark.parametrize("size", [(16200, 16200), (65000, 300), (8193, 8193)])
+def test_no_file_can_have_images_far_larger_than_itself(tmp_path, monkeypatch, write, suffix, size):
+    write(tmp_path / f"v.{suffix}", *size)
+    monkeypatch.setattr(video_file, "_decoded", lambda *_: pytest.fail("an image was decoded"))
+    with pytest.raises(InputError, match=r"states \d+x\d+ pixels|cannot be opened"):
+        VideoFile(tmp_path / f"v.{suffix}")
+
+
+def test_an_image_that_grows_in_mid_stream_is_not_decoded(tmp_path, monkeypatch):
+    small, large = [gradient_image(0)] * 12, [np.zeros((480, 640, 3), np.uint8)] * 2
+    for name, images in (("a", small), ("b", large)):
+        write_video(tmp_path / f"{name}.h264", images)
+    whole = b"".join((tmp_path / f"{name}.h264").read_bytes() for name in "ab")
+    (tmp_path / "v.h264").write_bytes(whole)
+    with video_file._open(tmp_path / "v.h264") as container:
+        shapes = [f and (f.width, f.height) for f in video_file._decoded(container, tmp_path)]
+    assert shapes[-1] == (640, 480)
+    monkeypatch.setattr(video_limits, "MOST_PIXELS", 64 * 48)
+    with video_file._open(tmp_path / "v.h264") as container:
+        shapes = {f and (f.width, f.height) for f in video_file._decoded(container, tmp_path)}
+    assert shapes == {(64, 48), None}
+
+
+@pytest.mark.parametrize("code", [b"ZZZZ", b"\0\0\0\0", b"none"])
+def test_a_video_of_an_unknown_codec_is_refused_in_a_sentence(tmp_path, code):
+    path = write_video(tmp_path / "v.avi", [gradient_image(i) for i in range(3)], codec="mpeg4")
+    path.write_bytes(path.read_bytes().replace(b"FMP4", code))
+    with pytest.raises(InputError, match=r"v\.avi (is a video of a codec|holds no picture)"):
+        VideoFile(path)
+
+
+@pytest.mark.parametrize(
+    ("stated", "taken"),
+    [(None, 30), (0.0, 30), (1e-9, 30), (1e9, 30), (Fraction(30000, 1001), 29.97), (math.nan, 30)],
+)
+def test_a_rate_that_no_camera_has_counts_as_unknown(stated, taken):
+    assert video_limits.nominal_rate(stated) == pytest.approx(taken, abs=0.01)

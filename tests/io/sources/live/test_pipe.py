@@ -76,7 +76,10 @@ def test_a_wrong_format_ends_in_a_sentence(words):
 @pytest.mark.parametrize(
     "data",
     [b"", b"P6 16 12 255\n", b"YUV4MPEG2 W16\n", b"YUV4MPEG2 Wx Hy\n",
-     b"YUV4MPEG2 W16 H12 C410\n", b"YUV4MPEG2 W99999 H99999\n"],
+     b"YUV4MPEG2 W16 H12 C410\n", b"YUV4MPEG2 W99999 H99999\n", b"YUV4MPEG2 W-16 H-12\n",
+     *(b"YUV4MPEG2 W16 H12 F%s\n" % rate for rate in (
+         b"1e999999999", b"1e999999999:1", b"1:1e999999999", b"9" * 400 + b":1", b"-30:1", b"30",
+         b"999999999:1", b"1:999999999"))],
 )  # fmt: skip
 def test_a_wrong_header_ends_in_a_sentence(data):
     with pytest.raises(InputError, match="pipe"):

@@ -15,8 +15,10 @@ from jaxtyping import UInt8
 
 from geogs.documents import require_file
 from geogs.errors import InputError
+from geogs.io.pictures import most_pixels
 from geogs.io.sources.account import Account
-from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.reader import RawFrame, RecordingInfo, size_of
+from geogs.io.sources.video_limits import check_decodable, nominal_rate
 
 # FFmpeg also "plays" text, pictures, devices, and play lists, which open the files they name
 # before they can be checked; none of them is a video file.
@@ -55,7 +57,7 @@ class VideoFile:
                 path.name,
                 width,
                 height,
-                fps=float(stream.average_rate or stream.guessed_rate or 30),
+                fps=nominal_rate(stream.average_rate or stream.guessed_rate, least=1e-3),
                 length=stream.frames or None,
                 quarter_turns=turns,
                 seconds=_seconds(container),
@@ -183,6 +185,7 @@ def _open(path: Path) -> InputContainer:
         container.close()
         what = "a single picture" if is_picture else "no video"
         raise InputError(f"{path} is {what}; give a video file or a folder of images.")
+    check_decodable(container, str(path), most_pixels(size_of(path) or 0))
     return container
 
 

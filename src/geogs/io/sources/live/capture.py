@@ -8,6 +8,7 @@ import cv2
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.video_limits import nominal_rate
 
 MOST_MISSED = 30
 """Number of missed images in a row after which a camera counts as gone."""
@@ -25,8 +26,7 @@ class Capture:
             if not is_there or image is None:
                 raise InputError(f"{address.name} is open, but gives no image.")
             height, width = image.shape[:2]
-            nominal = float(capture.get(cv2.CAP_PROP_FPS))
-            fps = nominal if 1.0 <= nominal <= 1000.0 else 30.0
+            fps = nominal_rate(capture.get(cv2.CAP_PROP_FPS))
             self.info = RecordingInfo(address.kind, address.name, width, height, fps)
         finally:
             capture.release()

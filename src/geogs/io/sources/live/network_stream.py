@@ -10,6 +10,7 @@ from av.container import InputContainer
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.video_limits import check_decodable, nominal_rate
 
 PATIENCE = 10.0
 """Timeout in seconds after which a stream counts as gone."""
@@ -31,8 +32,7 @@ class NetworkStream:
             first = next(_frames(container), None)
             if first is None:
                 raise InputError(f"{address.name} is open, but gives no image.")
-            nominal = float(stream.average_rate or stream.guessed_rate or 0)
-            fps = nominal if 1.0 <= nominal <= 1000.0 else 30.0
+            fps = nominal_rate(stream.average_rate or stream.guessed_rate)
             self.info = RecordingInfo(address.kind, address.name, first.width, first.height, fps)
 
     def frames(self) -> Generator[RawFrame, None, None]:
@@ -53,6 +53,7 @@ class NetworkStream:
         if not container.streams.video:
             container.close()
             raise InputError(f"{name} is open, but gives no image.")
+        check_decodable(container, name)
         return container
 
 

@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Generator
 from dataclasses import dataclass
-from fractions import Fraction
 from io import BufferedIOBase
 
 import cv2
@@ -17,11 +16,11 @@ from jaxtyping import UInt8
 
 from geogs.errors import InputError
 from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.video_limits import MOST_PIXELS
 
 _RAW = re.compile(r"(\d{1,5})x(\d{1,5}):(rgb24|bgr24|gray|yuv420p)(?:@(\d+(?:\.\d+)?))?")
 _MAGIC = b"YUV4MPEG2 "
 _LONGEST_LINE = 1024
-_MOST_PIXELS = 1 << 26
 _FORMATS = {"420": "yuv420p", "mono": "gray", "444": "yuv444p"}
 
 _LEVELS = np.arange(256)
@@ -68,24 +67,23 @@ def format_from_words(words: str) -> RawFormat:
 def format_from_header(line: bytes) -> RawFormat:
     """Read the header of YUV4MPEG2. Raises InputError."""
     said = {word[:1]: word[1:] for word in line.decode("ascii", "replace").split()[1:]}
-    try:
-        width, height = int(said["W"]), int(said["H"])
-        rate = Fraction(said.get("F", "0:0").replace(":", "/"))
-        fps: float | None = float(rate)
-    except (KeyError, ValueError):
-        raise InputError("The header of the pipe's YUV4MPEG2 is damaged.") from None
-    except ZeroDivisionError:
-        fps = None
+    numbers = f"{said.get('W')} {said.get('H')} {said.get('F', '0:0')}"
+    found = re.fullmatch(r"(\d{1,5}) (\d{1,5}) (\d{1,9}):(\d{1,9})", numbers)
+    if found is None:
+        raise InputError("The header of the pipe's YUV4MPEG2 is damaged.")
+    width, height, images, seconds = map(int, found.groups())
+    fps = images / seconds if images and seconds else None
     chroma = said.get("C", "420")
     kind = "420" if chroma in ("420", "420jpeg", "420paldv", "420mpeg2") else chroma
     if kind not in _FORMATS:
         raise InputError(f"The pipe's YUV4MPEG2 is C{chroma[:16]}; 420, 444 and mono are read.")
     is_full = b"XCOLORRANGE=FULL" in line
-    return _checked(RawFormat(width, height, _FORMATS[kind], fps or None, True, is_full))
+    return _checked(RawFormat(width, height, _FORMATS[kind], fps, True, is_full))
 
 
 def _checked(form: RawFormat) -> RawFormat:
-    if not (0 < form.width * form.height <= _MOST_PIXELS and (form.fps is None or form.fps > 0)):
+    has_rate = form.fps is None or 1e-3 <= form.fps <= 1e4
+    if not (0 < form.width * form.height <= MOST_PIXELS and has_rate):
         raise InputError("The pipe's frames have no size or rate that there is.")
     return form
 
