@@ -130,6 +130,8 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
+
+        from geogs.io.sources.ros.database import Recording
     except ImportError as error:
         raise InputError(
             f"{path} is a recording of ROS; pip install 'geogs[ros]' brings what reads it."
@@ -138,6 +140,8 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         # The image types are the same in all of ROS 2, whose older bags do not describe them.
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        if bag.is2:
+            bag.readers = [Recording(path)]
         bag.open()
     except Exception as error:  # errors of its own, of SQLite, of YAML, of a damaged file
         raise InputError(
