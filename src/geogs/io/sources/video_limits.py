@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 
+import av
 from av.container import InputContainer
 
 from geogs.errors import InputError
@@ -9,6 +10,18 @@ from geogs.io.pose_files import FRAMES_PER_SECOND
 
 MOST_PIXELS = 1 << 26
 """Most pixels of an image of a video or a stream: 8192 x 8192."""
+# FFmpeg also "plays" text, pictures, devices, and play lists, which open the files they name
+# before they can be checked; none of them is a video file.
+_NOT_VIDEO = (
+    "tty image2 image2pipe hls concat concatf dash webm_dash_manifest sdp rtp rtsp sap imf vobsub "
+    "lrc srt lavfi avisynth vapoursynth alsa oss fbdev kmsgrab x11grab xcbgrab video4linux2,v4l2"
+)
+
+
+def video_formats(*more: str) -> str:
+    """Names of FFmpeg's formats that lead to no other address, and of ``more``, as its option."""
+    names = av.formats_available.difference(_NOT_VIDEO.split())
+    return ",".join(sorted(names.union(more)))
 
 
 def nominal_rate(stated: Fraction | float | None, least: float = 1.0) -> float:

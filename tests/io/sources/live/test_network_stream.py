@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -18,19 +19,44 @@ from geogs.io.sources.live.network_stream import NetworkStream
 from io_samples import gradient_image, write_video
 
 
-class Quiet(SimpleHTTPRequestHandler):
+class Handler(SimpleHTTPRequestHandler):
+    """Serves a folder, redirects ``/to/ADDRESS``, and notes what was asked for."""
+
     def log_message(self, *_: object) -> None:
         pass
+
+    def do_GET(self) -> None:
+        self.server.asked.append(self.path)
+        if self.path.startswith("/to/"):
+            self.send_response(302)
+            self.send_header("Location", self.path.removeprefix("/to/"))
+            self.end_headers()
+            return
+        super().do_GET()
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[ThreadingHTTPServer]:
+    handler = functools.partial(Handler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        server.asked = []
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server
+        server.shutdown()
 
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
     """A folder, and where it is served."""
-    handler = functools.partial(Quiet, directory=str(tmp_path))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+    with serving(tmp_path) as server:
         yield tmp_path, f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The same folder on another host, and what is asked for there."""
+    with serving(tmp_path) as server:
+        yield f"http://localhost:{server.server_port}", server.asked
 
 
 def opened(address: str) -> NetworkStream:
@@ -61,19 +87,58 @@ def test_what_is_no_stream_is_a_sentence_without_its_password(served):
             opened(f"{place.replace('//', '//user:secret@')}/{name}")
 
 
-def test_a_play_list_of_the_network_leads_to_no_file_of_this_machine(served, tmp_path):
+def play_list(*lines: str, segment: bool = True) -> str:
+    kind = "#EXTINF:1," if segment else "#EXT-X-STREAM-INF:BANDWIDTH=1280000"
+    each = [word for line in lines for word in (kind, line)]
+    return "\n".join(["#EXTM3U", "#EXT-X-TARGETDURATION:1", *each, "#EXT-X-ENDLIST", ""])
+
+
+def test_a_play_list_of_one_host_gives_its_images(served):
     folder, place = served
-    secret = write_video(tmp_path / "secret.ts", [gradient_image(i) for i in range(12)])
-    lines = [
-        "#EXTM3U",
-        "#EXT-X-TARGETDURATION:1",
-        "#EXTINF:1,",
-        f"file://{secret}",
-        "#EXT-X-ENDLIST",
-    ]
-    (folder / "list.m3u8").write_text("\n".join(lines) + "\n")
-    with pytest.raises(InputError):
-        opened(f"{place}/list.m3u8")
+    for name in "ab":
+        write_video(folder / f"{name}.ts", [gradient_image(i) for i in range(12)])
+    (folder / "list.m3u8").write_text(play_list("a.ts", f"{place}/b.ts"))
+    (folder / "all.m3u8").write_text(play_list("list.m3u8", segment=False))
+    for name in ("list", "all"):
+        assert len(list(opened(f"{place}/{name}.m3u8").frames())) >= 23
+
+
+SDP = """v=0
+o=- 0 0 IN IP4 127.0.0.1
+s=x
+c=IN IP4 127.0.0.1
+t=0 0
+m=video 45678 RTP/AVP 96
+a=rtpmap:96 H264/90000
+"""
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "/to/{other}/v.ts", "/to/{other}/own.m3u8", "/other.m3u8", "/other-list.m3u8",
+        "/redirected.m3u8", "/file.m3u8", "/list.ts", "/words.sdp", "/list.mkv",
+    ],
+)  # fmt: skip
+def test_a_server_leads_to_no_other_host_and_to_no_file(served, elsewhere, address):
+    folder, place = served
+    other, asked = elsewhere
+    video = write_video(folder / "v.ts", [gradient_image(i) for i in range(12)])
+    (folder / "own.m3u8").write_text(play_list("v.ts"))
+    (folder / "other.m3u8").write_text(play_list(f"{other}/v.ts"))
+    (folder / "other-list.m3u8").write_text(play_list(f"{other}/own.m3u8", segment=False))
+    (folder / "redirected.m3u8").write_text(play_list(f"/to/{other}/v.ts"))
+    (folder / "file.m3u8").write_text(play_list(f"file://{video}"))
+    for name in ("list.ts", "list.mkv"):
+        (folder / name).write_text(play_list(f"{other}/v.ts"))
+    (folder / "words.sdp").write_text(SDP)
+    begin = time.monotonic()
+    with pytest.raises(InputError) as refused:
+        opened(place + address.format(other=other))
+    assert time.monotonic() - begin < network_stream.PATIENCE
+    assert not asked
+    if "list." not in address and "sdp" not in address:
+        assert f"leads to {'file:' if 'file' in address else other}" in str(refused.value)
 
 
 def test_a_server_that_never_answers_is_not_waited_for(monkeypatch):

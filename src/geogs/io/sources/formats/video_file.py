@@ -18,17 +18,11 @@ from geogs.errors import InputError
 from geogs.io.pictures import most_pixels
 from geogs.io.sources.account import Account
 from geogs.io.sources.reader import RawFrame, RecordingInfo, size_of
-from geogs.io.sources.video_limits import check_decodable, nominal_rate
+from geogs.io.sources.video_limits import check_decodable, nominal_rate, video_formats
 
-# FFmpeg also "plays" text, pictures, devices, and play lists, which open the files they name
-# before they can be checked; none of them is a video file.
-_NOT_VIDEO = (
-    "tty image2 image2pipe hls concat concatf dash webm_dash_manifest sdp rtp rtsp sap imf vobsub "
-    "lrc srt lavfi avisynth vapoursynth alsa oss fbdev kmsgrab x11grab xcbgrab video4linux2,v4l2"
-)
 _OPTIONS = {
     "protocol_whitelist": "file",  # no container may lead to the network
-    "format_whitelist": ",".join(sorted(av.formats_available.difference(_NOT_VIDEO.split()))),
+    "format_whitelist": video_formats(),
 }
 
 _log = logging.getLogger(__name__)
