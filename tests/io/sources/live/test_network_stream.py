@@ -1,6 +1,7 @@
 """Streams of a server on this machine: their images, and no waiting where there is no answer."""
 
 import functools
+import signal
 import socket
 import threading
 import time
@@ -148,3 +149,19 @@ def test_a_server_that_never_answers_is_not_waited_for(monkeypatch):
         with pytest.raises(InputError, match="is it reachable"):
             opened(f"http://127.0.0.1:{silent.getsockname()[1]}/v.mp4")
         assert time.monotonic() - begin < 5
+
+
+def test_a_signal_is_obeyed_while_a_server_is_waited_for(monkeypatch):
+    monkeypatch.setattr(network_stream, "PATIENCE", 60.0)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, stop)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        signal.setitimer(signal.ITIMER_REAL, 0.5)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                opened(f"http://127.0.0.1:{silent.getsockname()[1]}/v.mp4")
+        finally:
+            signal.signal(signal.SIGALRM, before)
