@@ -118,7 +118,7 @@ a=rtpmap:96 H264/90000
     "address",
     [
         "/to/{other}/v.ts", "/to/{other}/own.m3u8", "/other.m3u8", "/other-list.m3u8",
-        "/redirected.m3u8", "/file.m3u8", "/list.ts", "/words.sdp", "/list.mkv",
+        "/redirected.m3u8", "/file.m3u8", "/list.ts", "/words.sdp", "/list.mkv", "/none.m3u8",
     ],
 )  # fmt: skip
 def test_a_server_leads_to_no_other_host_and_to_no_file(served, elsewhere, address):
@@ -138,7 +138,7 @@ def test_a_server_leads_to_no_other_host_and_to_no_file(served, elsewhere, addre
         opened(place + address.format(other=other))
     assert time.monotonic() - begin < network_stream.PATIENCE
     assert not asked
-    if "list." not in address and "sdp" not in address:
+    if not address.startswith(("/list.", "/words", "/none")):
         assert f"leads to {'file:' if 'file' in address else other}" in str(refused.value)
 
 
@@ -165,3 +165,21 @@ def test_a_signal_is_obeyed_while_a_server_is_waited_for(monkeypatch):
                 opened(f"http://127.0.0.1:{silent.getsockname()[1]}/v.mp4")
         finally:
             signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("address", ["http://[x/v.mp4", "http://[x/l.m3u8", "http://:x/l.m3u8"])
+def test_an_address_that_is_none_is_a_sentence(address):
+    with pytest.raises(InputError, match="cannot be opened"):
+        opened(address)
+
+
+@pytest.mark.parametrize("entry", ["http://[x/v.ts", "ftp://127.0.0.1/v.ts", "//x:y/v.ts", "\\"])
+def test_an_address_in_a_play_list_that_is_none_ends_the_stream(served, entry):
+    folder, place = served
+    write_video(folder / "v.ts", [gradient_image(i) for i in range(12)])
+    (folder / "l.m3u8").write_text(play_list("v.ts", "v.ts", entry))
+    try:
+        frames = list(opened(f"{place}/l.m3u8").frames())
+    except InputError:
+        frames = []
+    assert len(frames) in (0, *range(20, 25))

@@ -5,7 +5,6 @@ import time
 from collections.abc import Generator
 from contextlib import suppress
 from http.client import HTTPException
-from urllib.parse import urlsplit
 
 import av
 from av.container import InputContainer
@@ -62,7 +61,7 @@ class NetworkStream:
     def _open(self) -> InputContainer:
         name, target = self._address.name, self._address.target
         is_web = target.startswith(("http://", "https://"))
-        is_list = is_web and urlsplit(target).path.lower().endswith((".m3u8", ".m3u"))
+        is_list = is_web and target.partition("?")[0].endswith((".m3u8", ".m3u"))
         same_host = SameHost(target, name, PATIENCE)
         options = {**_OPTIONS, "format_whitelist": video_formats("hls" if is_list else "rtsp")}
         try:
@@ -72,7 +71,7 @@ class NetworkStream:
         except (av.error.FFmpegError, OSError, ValueError, HTTPException) as error:
             if is_web and not isinstance(error, av.error.ExitError):  # it has answered
                 same_host.refuse_redirection()
-            raise InputError(f"{name} cannot be opened; is it reachable?") from None
+            raise InputError(f"{name} cannot be opened; is it reachable, and a video?") from None
         if not container.streams.video:
             container.close()
             raise InputError(f"{name} is open, but gives no image.")
@@ -88,5 +87,5 @@ def _frames(container: InputContainer) -> Generator[av.VideoFrame, None, None]:
                 yield from packet.decode()
     except InputError as error:
         _log.warning("%s", error)
-    except (av.error.FFmpegError, OSError, HTTPException):
+    except (av.error.FFmpegError, OSError, ValueError, HTTPException):
         return

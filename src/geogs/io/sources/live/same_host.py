@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from http.client import HTTPException, HTTPResponse
 from typing import NoReturn
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, build_opener
 
@@ -14,11 +15,8 @@ class SameHost:
     """Opens addresses on the host of a stream, as PyAV asks for what a play list names."""
 
     def __init__(self, target: str, name: str, patience: float) -> None:
-        """Args:
-        target: the address that the user named.
-        name: its name in messages.
-        patience: seconds to wait for each answer.
-        """
+        """``target`` is the address that the user named, ``name`` stands for it in messages, and
+        ``patience`` is the wait for an answer in seconds."""
         self._target = target
         self._name = name
         self._patience = patience
@@ -35,7 +33,11 @@ class SameHost:
         is_own = place.hostname == urlsplit(self._target).hostname
         if place.scheme not in ("http", "https") or not is_own:
             self._refuse(url)
-        answer: HTTPResponse = self._opener.open(url, timeout=self._patience)
+        try:
+            answer: HTTPResponse = self._opener.open(url, timeout=self._patience)
+        except HTTPError as error:
+            error.close()
+            raise
         return answer
 
     def refuse_redirection(self) -> None:
