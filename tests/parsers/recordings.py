@@ -9,6 +9,7 @@ from PIL import Image
 import mutations
 from bag_samples import BagWriter
 from geogs.config import InputConfig
+from geogs.io.sources.live.pipe import Pipe
 from geogs.io.sources.sniff import open_source
 from io_samples import gradient_image, write_image, write_video
 from parsers.base import Damage, Parser, tiny_room
@@ -30,6 +31,9 @@ def recordings() -> dict[str, Parser]:
         "video-turned": video("v.mp4", rotation=90),
         "video-mkv": video("v.mkv"),
         "video-avi": video("v.avi", "mpeg4"),
+        "video-gif": Parser(gif, ("v.gif",), mutations.binary, all_of("v.gif")),
+        "video-y4m": Parser(yuv, ("v.y4m",), mutations.text, all_of("v.y4m")),
+        "pipe-y4m": Parser(yuv, ("v.y4m",), mutations.text, piped),
         "bag-ros1": bag("bag"),
         "bag-sqlite": bag("sqlite"),
         "bag-mcap": bag("mcap"),
@@ -93,6 +97,22 @@ def video(name: str, codec: str = "libx264", rotation: int = 0) -> Parser:
         lambda folder: write_video(folder / name, frames, codec=codec, rotation=rotation),
         (name,), mutations.binary, all_of(name),
     )  # fmt: skip
+
+
+def gif(folder: Path) -> None:
+    first, *others = [Image.fromarray(gradient_image(i)) for i in range(3)]
+    first.save(folder / "v.gif", save_all=True, append_images=others)
+
+
+def yuv(folder: Path) -> None:
+    """YUV4MPEG2, whose levels are letters, so that its lines can be damaged as text."""
+    frame = b"FRAME\n" + b"x" * (64 * 48 * 3 // 2)
+    (folder / "v.y4m").write_bytes(b"YUV4MPEG2 W64 H48 F30:1 Ip A1:1 C420\n" + 3 * frame)
+
+
+def piped(folder: Path) -> list[float]:
+    with (folder / "v.y4m").open("rb") as stream:
+        return [frame.timestamp for frame in Pipe(stream).frames()]
 
 
 def bag(kind: str, name: str = "", damage: Damage = mutations.binary) -> Parser:

@@ -76,7 +76,7 @@ def format_from_header(line: bytes) -> RawFormat:
     chroma = said.get("C", "420")
     kind = "420" if chroma in ("420", "420jpeg", "420paldv", "420mpeg2") else chroma
     if kind not in _FORMATS:
-        raise InputError(f"The pipe's YUV4MPEG2 is C{chroma[:16]}; 420, 444 and mono are read.")
+        raise InputError(f"The pipe's YUV4MPEG2 is C{chroma[:16]!a}; 420, 444 and mono are read.")
     is_full = b"XCOLORRANGE=FULL" in line
     return _checked(RawFormat(width, height, _FORMATS[kind], fps, True, is_full))
 
