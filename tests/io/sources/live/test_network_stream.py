@@ -80,6 +80,27 @@ def test_a_stream_gives_its_images_as_they_come(served):
     assert times == sorted(times)
 
 
+def test_no_connection_is_left_open_before_the_images_come(served):
+    folder, place = served
+    write_video(folder / "v.mkv", [gradient_image(i) for i in range(12)])
+    is_open = []
+
+    @contextmanager
+    def noted(stream):
+        with NetworkStream._open(stream) as container:
+            is_open.append(stream)
+            yield container
+        is_open.remove(stream)
+
+    class Noted(NetworkStream):
+        _open = noted
+
+    stream = Noted(live_address(f"{place}/v.mkv"))
+    assert not is_open
+    assert len(list(stream.frames())) == 12
+    assert not is_open
+
+
 def test_what_is_no_stream_is_a_sentence_without_its_password(served):
     folder, place = served
     (folder / "words.txt").write_text("no video")

@@ -35,9 +35,11 @@ class NetworkStream:
         """Raises InputError if it cannot be opened or gives no image."""
         self._address = address
         # Signals are handled while a thread waits for the server.
-        found = Latest(self._described()).take()
+        opening = Latest(self._described())
+        found = opening.take()
         assert found is not None, "an error is raised by take"
         self.info = found
+        opening.close()  # a camera may allow one connection alone
 
     def frames(self) -> Generator[RawFrame, None, None]:
         """Images from now on, with their time of arrival in seconds since the start."""
