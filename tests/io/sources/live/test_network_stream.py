@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -170,6 +171,18 @@ def test_a_server_that_never_answers_is_not_waited_for(monkeypatch):
         with pytest.raises(InputError, match="is it reachable"):
             opened(f"http://127.0.0.1:{silent.getsockname()[1]}/v.mp4")
         assert time.monotonic() - begin < 5
+
+
+def test_an_ffmpeg_that_follows_redirections_is_not_given_any(served, elsewhere, monkeypatch):
+    folder, place = served
+    other, asked = elsewhere
+    write_video(folder / "v.ts", [gradient_image(i) for i in range(12)])
+    monkeypatch.setitem(network_stream._OPTIONS, "max_redirects", "8")
+    monkeypatch.setitem(av.library_versions, "libavformat", (61, 7, 100))
+    with pytest.raises(InputError, match=f"leads to {other}/v.ts"):
+        opened(f"{place}/to/{other}/v.ts")
+    assert not asked
+    assert len(list(opened(f"{place}/v.ts").frames())) == 12
 
 
 def test_a_signal_is_obeyed_while_a_server_is_waited_for(monkeypatch):

@@ -66,6 +66,8 @@ class NetworkStream:
         is_list = is_web and target.partition("?")[0].endswith((".m3u8", ".m3u"))
         same_host = SameHost(target, name, PATIENCE)
         options = {**_OPTIONS, "format_whitelist": video_formats("hls" if is_list else "rtsp")}
+        if is_web and av.library_versions["libavformat"] < (62, 12):  # it knows no max_redirects
+            same_host.refuse_redirection()
         try:
             container = av.open(
                 target, timeout=PATIENCE, options=options, io_open=same_host if is_list else None
