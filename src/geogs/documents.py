@@ -16,6 +16,7 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from geogs.errors import InputError
+from geogs.terminal_text import printable
 
 LARGEST_TEXT = 1 << 30
 """Bytes of a table, such as the poses of a long sequence or the points of a COLMAP model."""
@@ -182,7 +183,7 @@ def yaml_value(text: str, name: str) -> Any:
 def in_short(error: Exception | str) -> str:
     """Return the first line of an error's message, printable and of limited length."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
-    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
+    plain = printable(said)
     return plain if len(plain) <= _LONGEST_MESSAGE else f"{plain[:_LONGEST_MESSAGE]}..."
 
 

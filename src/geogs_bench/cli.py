@@ -1,10 +1,11 @@
 """``geogs bench NAME [DATA]``: a benchmark in one command, with its tables as files."""
 
-import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from geogs.cli.options import parse_options
+from geogs.terminal_text import printable, say
 from geogs_bench.bench_options import BenchOptions
 
 if TYPE_CHECKING:
@@ -22,16 +23,16 @@ def main(argv: Sequence[str]) -> int:
     from geogs_bench.bench import bench, listing
 
     if options.name == "list":
-        print(listing())
+        say(*listing().splitlines())
         return 0
     if options.name == "board":
         return _board(options)
     if options.name == "sensitivity":
         return _sensitivity(options)
-    done = bench(options, lambda text: print(text, file=sys.stderr, flush=True))
+    done = bench(options, partial(say, is_error=True))
     for table in _tables(done):
-        Console().print(table)
-    print(f"Results are in {done.output}/ (results.md, results.json, report/index.html)")
+        Console(markup=False).print(table)
+    say(f"Results are in {done.output}/ (results.md, results.json, report/index.html)")
     records = [record for chapter in done.chapters for record in chapter.records]
     return 2 if not records or any(record.error for record in records) else 0
 
@@ -41,8 +42,8 @@ def _board(options: BenchOptions) -> int:
     from geogs_bench.board.board import board
     from geogs_bench.board.comparison import markdown
 
-    done, changes = board(options, lambda text: print(text, file=sys.stderr, flush=True))
-    print(markdown(done, changes), end="")
+    done, changes = board(options, partial(say, is_error=True))
+    say(*markdown(done, changes).splitlines())
     if any(row.failures for row in done.rows):
         return 2
     return 1 if any(change.is_worse for change in changes) else 0
@@ -52,9 +53,7 @@ def _sensitivity(options: BenchOptions) -> int:
     """Halve and double constants on the board."""
     from geogs_bench.board.sensitivity import sensitivity, table
 
-    print(
-        table(sensitivity(options, lambda text: print(text, file=sys.stderr, flush=True))), end=""
-    )
+    say(*table(sensitivity(options, partial(say, is_error=True))).splitlines())
     return 0
 
 
@@ -70,5 +69,5 @@ def _tables(done: "BenchResult") -> "list[Table]":
         for column in shown[-1].columns[1:]:
             column.justify = "right"
         for row in table.rows:
-            shown[-1].add_row(*row)
+            shown[-1].add_row(*map(printable, row))
     return shown

@@ -7,6 +7,7 @@ from typing import TypeVar, cast
 from geogs.cli.options import Given, parse_options
 from geogs.config import Preset, preset
 from geogs.errors import InputError
+from geogs.terminal_text import say
 from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 
 Options = TypeVar("Options", bound=FleetOptions)
@@ -36,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     result = run_fleet(options, TerminalFleet(options.quiet), config_on_gpu=config_on_gpu)
     seconds = time.perf_counter() - begin
     if not options.quiet:
-        print(closing_message(result.rows, result.computed, result.output, seconds))
+        say(*closing_message(result.rows, result.computed, result.output, seconds))
     return EXIT_FAILED if any(row.state != "done" for row in result.rows) else 0
 
 
@@ -50,7 +51,7 @@ def _join(words: Sequence[str]) -> int:
     progress = TerminalFleet(options.quiet)
     joint = run_join(options, progress, progress.say, config_on_gpu)
     if not options.quiet:
-        print(f"{joint.sentence}\nOpen {joint.output}/report/index.html in a browser.")
+        say(joint.sentence, f"Open {joint.output}/report/index.html in a browser.")
     return EXIT_FAILED if joint.unjoined else 0
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from rich.console import Console
 
 from geogs.evaluation.duration import duration
+from geogs.terminal_text import printable
 from geogs_fleet.table import Row
 
 
@@ -56,7 +57,7 @@ class TerminalFleet(FleetProgress):
         """Print the number of sources."""
         self._sources = sources
         before = f", {done_before} of them done before" if done_before else ""
-        self._console.print(f"{_sources(sources)}{before}; {at_once} at a time.", markup=False)
+        self.say(f"{_sources(sources)}{before}; {at_once} at a time.")
 
     def ended(self, row: Row, left: int, seconds_left: float) -> None:
         """Print the outcome of a source."""
@@ -64,22 +65,22 @@ class TerminalFleet(FleetProgress):
         rest = f"; about {duration(seconds_left)} left" if left else ""
         how = "" if row.state == "done" else "failed: "
         head = f"{done}/{self._sources} {row.name} ({duration(row.seconds)}{rest})"
-        self._console.print(f"{head}: {how}{row.sentence}", markup=False)
+        self.say(f"{head}: {how}{row.sentence}")
 
     def say(self, sentence: str) -> None:
         """Print any other sentence."""
-        self._console.print(sentence, markup=False)
+        self._console.print(printable(sentence), markup=False)
 
 
-def closing_message(rows: list[Row], computed: int, output: str, seconds: float) -> str:
-    """Closing message for the standard output."""
+def closing_message(rows: list[Row], computed: int, output: str, seconds: float) -> list[str]:
+    """Closing lines for the standard output."""
     failed = sum(row.state != "done" for row in rows)
     doubtful = sum(row.is_reliable is False for row in rows)
     parts = [f"{len(rows) - failed} of {_sources(len(rows))} done"]
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{doubtful} not reliable"] if doubtful else []
     said = f"{', '.join(parts)}; {computed} computed in {duration(seconds)}."
-    return f"{said}\nOpen {output.rstrip('/')}/index.html in a browser."
+    return [said, f"Open {output.rstrip('/')}/index.html in a browser."]
 
 
 def _sources(number: int) -> str:

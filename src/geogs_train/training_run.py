@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from geogs.errors import GeogsError, InputError
+from geogs.terminal_text import say
 from geogs_train.course import Worker
 from geogs_train.depth.depth_validation import DepthValidation
 from geogs_train.flow.flow_validation import SceneValidation
@@ -76,7 +77,7 @@ def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) ->
                 if first:
                     entry = {"step": trainer.step, "loss": value, "rate": rate}
                     _log(out, {**entry, "minutes": (now - begin) / 60})
-                    _say(
+                    say(
                         f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
                         f"loss {value:.3f}  {rate:.1f} steps/s"
                     )
@@ -88,7 +89,7 @@ def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) ->
                 since = time.monotonic()
                 at = trainer.step
     except KeyboardInterrupt:
-        _say("interrupted; writing what there is")
+        say("interrupted; writing what there is")
     finally:
         course.close()
     if validation is not None:
@@ -101,13 +102,9 @@ def _save(
     """Validate, and write the checkpoint and the weights."""
     scores: Any = validation.score(trainer.mean)
     _log(out, {"step": trainer.step, "scores": asdict(scores)})
-    _say(f"validation at step {trainer.step}: {scores.line()}")
+    say(f"validation at step {trainer.step}: {scores.line()}")
     save_checkpoint(trainer, out)
     trainer.course.export(trainer.mean, out / trainer.course.weights, trainer.step, scores)
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)
 
 
 def _log(out: Path, entry: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
+from geogs.terminal_text import say
 
 SCRIPTS = {
     "bash": """\
@@ -54,5 +55,5 @@ class CompletionOptions:
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    print(SCRIPTS[parse_options(CompletionOptions, argv, "completion").shell])
+    say(*SCRIPTS[parse_options(CompletionOptions, argv, "completion").shell].splitlines())
     return 0

@@ -11,6 +11,7 @@ from geogs.cli.command import find_command
 from geogs.cli.options import parse_options
 from geogs.config import Seed
 from geogs.config.setting import Basic, Range, Settings
+from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,9 @@ def demo(options: DemoOptions) -> int:
             "eval": (find_command("eval").run, [result, "--gt", room]),
         }
         for name, (command, arguments) in steps.items():
-            print(f"$ geogs {name} {' '.join(arguments)}", flush=True)
+            say(f"$ geogs {name} {' '.join(arguments)}")
             code = command(arguments)
             if code:
                 return code
-    print(f"Open {result}/report/index.html in a browser.")
+    say(f"Open {result}/report/index.html in a browser.")
     return 0

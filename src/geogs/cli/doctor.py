@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from geogs.cli.options import parse_options
+from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)
@@ -22,13 +23,12 @@ def main(argv: Sequence[str]) -> int:
 
     findings = []
     for finding in examine(options.device):
-        print(f"{finding.name:<13} {finding.text}", flush=True)
+        say(f"{finding.name:<13} {finding.text}")
         findings.append(finding)
     problems = [f.problem for f in findings if f.problem]
-    print()
+    say("")
     if problems:
-        print("To mend:")
-        print("\n".join(f"  - {problem}" for problem in problems))
+        say("To mend:", *(f"  - {problem}" for problem in problems))
     else:
-        print("everything works")
+        say("everything works")
     return 2 if any(f.is_fatal for f in findings) else 0

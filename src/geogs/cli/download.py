@@ -9,6 +9,7 @@ from geogs.application.download.sequences import SEQUENCES, find_sequence
 from geogs.application.run_settings import Verbosity
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
+from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse_options(DownloadOptions, argv, "download")
     if not options.name:
-        print(listing())
+        say(*listing().splitlines())
         return 0
     sequence = find_sequence(options.name)
 
@@ -39,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
     with TerminalProgress(options) as progress:
         progress.write(f"{sequence.name}: licence {sequence.licence}, see {sequence.page}")
         place = download(sequence, options.into, progress)
-    print(f"geogs run {place} reads it, and geogs eval RESULT --gt {place} its true poses.")
+    say(f"geogs run {place} reads it, and geogs eval RESULT --gt {place} its true poses.")
     return 0
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from geogs.application.result_settings import EvalSettings
 from geogs.cli.options import parse_options
+from geogs.terminal_text import printable
 
 
 def main(argv: Sequence[str]) -> int:
@@ -16,7 +17,9 @@ def main(argv: Sequence[str]) -> int:
     from geogs.evaluation.pages.evaluation_page import table
 
     evaluation = evaluate(options)
-    Console().print(table(evaluation))
+    Console(markup=False).print(table(evaluation))
     for sentence in evaluation.doubts:
-        Console(stderr=True).print(f"warning: {sentence}", style="bold red", highlight=False)
+        Console(stderr=True).print(
+            printable(f"warning: {sentence}"), markup=False, style="bold red", highlight=False
+        )
     return 0

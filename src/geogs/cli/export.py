@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from geogs.application.result_settings import ExportSettings
 from geogs.cli.options import parse_options
+from geogs.terminal_text import say
 
 
 def main(argv: Sequence[str]) -> int:
@@ -12,5 +13,5 @@ def main(argv: Sequence[str]) -> int:
 
     from geogs.application.export.export import export
 
-    print(f"Written: {export(options)}")
+    say(f"Written: {export(options)}")
     return 0

@@ -15,6 +15,7 @@ from geogs.cli.candidates import ASKED, matching
 from geogs.cli.command import all_commands, find_command
 from geogs.cli.terminal import process
 from geogs.errors import GeogsError
+from geogs.terminal_text import printable, say
 from geogs.version import __version__
 
 EXIT_ERROR = 2
@@ -46,14 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(arguments: list[str]) -> int:
     name, *rest = arguments or ["--help"]
     if name in ("-h", "--help", "help"):
-        print(help_text())
+        say(*help_text().splitlines())
         return 0
     if rest == [ASKED]:
         helps = {known: command.help for known, command in all_commands().items()}
-        print(matching(helps, name))
+        say(*matching(helps, name).splitlines())
         return 0
     if name in ("-V", "--version"):
-        print(f"geogs {__version__}")
+        say(f"geogs {__version__}")
         return 0
     command = find_command(name)
     process.show_warnings()
@@ -85,8 +86,7 @@ def help_text() -> str:
 def print_error(sentence: str) -> None:
     """Print one line to the standard error, in red on a terminal."""
     is_coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
-    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in sentence)
-    text = "error: " + _LONG_WORD.sub(r"\1...\2", plain)
+    text = "error: " + _LONG_WORD.sub(r"\1...\2", printable(sentence))
     print(f"\033[31m{text}\033[0m" if is_coloured else text, file=sys.stderr)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from geogs.application.result_settings import RemeshSettings
 from geogs.cli.options import Given, parse_options
+from geogs.terminal_text import say
 
 
 def main(argv: Sequence[str]) -> int:
@@ -16,7 +17,7 @@ def main(argv: Sequence[str]) -> int:
 
     with TerminalProgress() as progress:
         path = remesh(options, progress)
-    print(f"The mesh is {path}")
+    say(f"The mesh is {path}")
     return 0
 
 

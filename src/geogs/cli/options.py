@@ -7,7 +7,6 @@ option that is a tuple of texts can be repeated.
 """
 
 import difflib
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar
@@ -17,6 +16,7 @@ from geogs.cli.help import first_clause, help_text
 from geogs.config.leaves import Leaf, default_of, leaves
 from geogs.config.setting import Positional, dashed, group_of, refusal
 from geogs.errors import InputError
+from geogs.terminal_text import say
 
 Options = TypeVar("Options")
 Record = TypeVar("Record")
@@ -55,7 +55,7 @@ def parse_options(
         raise InputError(f"geogs {command} cannot do anything with {words[0]}.")
     missing = [leaf for leaf in known if leaf.name not in given and _is_needed(leaf, given)]
     if missing and not argv:
-        print(help_text(options, command, everything=False), file=sys.stderr)
+        say(*help_text(options, command, everything=False).splitlines(), is_error=True)
         raise SystemExit(2)
     if missing:
         name = (*missing[0].options, missing[0].name.upper())[0]
@@ -78,9 +78,10 @@ def _say_what_is_asked(
     """Print help or completions if they are requested; then SystemExit."""
     everything = "--help-all" in argv
     if argv and argv[-1] == ASKED:
-        print(matching(candidates(known, argv[:-1]), argv[-2] if argv[:-1] else ""))
+        found = matching(candidates(known, argv[:-1]), argv[-2] if argv[:-1] else "")
+        say(*found.splitlines())
     elif everything or "--help" in argv or "-h" in argv:
-        print(help_text(options, command, everything))
+        say(*help_text(options, command, everything).splitlines())
     else:
         return
     raise SystemExit(0)

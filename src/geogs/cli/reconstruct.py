@@ -10,6 +10,7 @@ from geogs.cli.options import Given, parse_options, record
 from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, reconstruct_preset
 from geogs.gpu.early_start import is_gpu, start_gpu
+from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def main(argv: Sequence[str]) -> int:
         options, lambda progress: reconstruct_to_folder(settings, progress, Interruption())
     )
     if result.can_resume:
-        print("The same command with --resume goes on from here.")
+        say("The same command with --resume goes on from here.")
     return 0
 
 

@@ -21,6 +21,7 @@ from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
 from geogs.io.sources.address import live_address
+from geogs.terminal_text import say
 
 if TYPE_CHECKING:
     from geogs.application.machine.compilation import Compilation
@@ -81,7 +82,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
     with quit_key(stop.request) if has_keys else nullcontext():
         result = followed(options, lambda progress: go(settings, progress, stop, observer))
     if result.can_resume:
-        print(f"geogs run --resume {result.folder} goes on from here.")
+        say(f"geogs run --resume {result.folder} goes on from here.")
     return 0
 
 
@@ -99,7 +100,7 @@ def _observer(options: LiveSettings) -> "RunObserver | None":
         from geogs.application.viewer.live_viewer import LiveViewer
 
         window = Window("geogs", HERE, options.viewer_port, with_disks=True)
-        print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
+        say(f"Open {window.address} in a browser to look on.", is_error=True)
         several.append(LiveViewer(window))
     return Observers(several) if several else None
 

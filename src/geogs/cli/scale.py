@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from geogs.application.result_settings import RescaleSettings
 from geogs.cli.options import parse_options
+from geogs.terminal_text import say
 
 
 def main(argv: Sequence[str]) -> int:
@@ -13,5 +14,5 @@ def main(argv: Sequence[str]) -> int:
     from geogs.application.results.revise import rescale
     from geogs.application.scale.measurable_scene import scale_sentence
 
-    print(scale_sentence(rescale(options)))
+    say(scale_sentence(rescale(options)))
     return 0

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from geogs.application.result_settings import ViewSettings
 from geogs.cli.options import parse_options
+from geogs.terminal_text import say
 
 
 def main(argv: Sequence[str]) -> int:
@@ -15,7 +16,7 @@ def main(argv: Sequence[str]) -> int:
     from geogs.application.viewer.saved import open_window
 
     window = open_window(load_result(options.result), options.host, options.port)
-    print(f"Open {window.address} in a browser; Ctrl-C ends.", flush=True)
+    say(f"Open {window.address} in a browser; Ctrl-C ends.")
     try:
         while True:
             time.sleep(3600)

@@ -17,6 +17,7 @@ from geogs.networks.weights_files import (
     require_intact,
     weights_folders,
 )
+from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,11 @@ def main(argv: Sequence[str]) -> int:
     if options.action == "list":
         if file is not None:
             raise InputError(f"geogs weights list takes no file; did you mean verify {file}?")
-        print(listing())
+        say(*listing().splitlines())
     else:
         if file is None:
             raise InputError("geogs weights verify needs a file.")
-        print(verification(file))
+        say(*verification(file).splitlines())
     return 0
 
 

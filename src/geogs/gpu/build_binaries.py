@@ -14,6 +14,7 @@ from geogs.errors import DeviceError
 from geogs.gpu.binaries import FOLDER, MACHINE_CODE, PTX, name_of
 from geogs.gpu.kernel_source import OPTIONS, PACKAGE, kernel_sources, read_source
 from geogs.gpu.nvrtc import Nvrtc, load_nvrtc
+from geogs.terminal_text import say
 
 CUDA = "13"
 """Major version; its drivers, and all later ones, load its code."""
@@ -49,10 +50,10 @@ def main() -> int:
         compiler = load_nvrtc(CUDA)
         size = build(compiler, sources)
     except DeviceError as error:
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {error}", is_error=True)
         return 2
     names = ", ".join((*MACHINE_CODE, PTX))
-    print(f"{len(sources)} sources for {names} by NVRTC {compiler.version}: {size:,} bytes")
+    say(f"{len(sources)} sources for {names} by NVRTC {compiler.version}: {size:,} bytes")
     return 0
 
 

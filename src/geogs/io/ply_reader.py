@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-from geogs.documents import read_bytes
+from geogs.documents import in_short, read_bytes
 from geogs.errors import InputError
 
 _KINDS = {
@@ -95,8 +95,7 @@ def read_ply(path: str | Path) -> dict[str, PlyElement]:
         for name, (count, properties) in layout.items():
             elements[name], start = _element(data, start, name, count, properties)
     except (ValueError, OverflowError, MemoryError) as error:
-        said = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
-        why = f" ({said})" if isinstance(error, _WrongPly) else ""
+        why = f" ({in_short(error)})" if isinstance(error, _WrongPly) else ""
         raise InputError(f"{path} is no readable PLY file{why}.") from None
     return elements
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from geogs.documents import require_file
+from geogs.documents import in_short, require_file
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.priors.card import PriorCard
@@ -208,9 +208,8 @@ def _open(model: Path, device: torch.device) -> Any:
 
 
 def _said(error: Exception) -> str:
-    """The reason in brackets, in letters that a terminal can show; empty if there is none."""
-    lines = str(error).encode("ascii", "replace").decode().split("\n")
-    words = "".join(c if c.isprintable() else "?" for c in lines[0])[:200].strip(" .")
+    """The reason in brackets; empty if there is none."""
+    words = in_short(str(error).encode("ascii", "replace").decode()).strip(" .")
     return f" ({words})" if words else ""
 
 

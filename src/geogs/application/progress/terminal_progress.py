@@ -16,6 +16,7 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.application.run_settings import Verbosity
 from geogs.errors import OutputError
 from geogs.evaluation.duration import duration
+from geogs.terminal_text import escape_records, printable
 
 if TYPE_CHECKING:
     from geogs.pose_estimate import PoseEstimate
@@ -86,8 +87,8 @@ class TerminalProgress(RunProgress):
             return
         self.note(text)
         if text.startswith("warning") and self._verbosity.quiet:
-            Console(stderr=True, highlight=False).print(text, soft_wrap=True, markup=False)
-        self._bar.console.print(text, soft_wrap=True, markup=False)
+            _print(Console(stderr=True, highlight=False), text)
+        _print(self._bar.console, text)
 
     def expect(self, frames: int | None) -> None:
         """Begin with the frames."""
@@ -149,7 +150,7 @@ class TerminalProgress(RunProgress):
         self._phase = self._last = ""
         self.note(text)
         if not self._bar.console.is_terminal or self._verbosity.verbose:
-            self._bar.console.print(text, soft_wrap=True, markup=False)
+            _print(self._bar.console, text)
 
     def _show(self, stage: str, what: str, info: str, done: float | None) -> None:
         """Update the line, or print a line of text if it is time for one.
@@ -177,13 +178,16 @@ class TerminalProgress(RunProgress):
         text = "  ".join(filter(None, (what, percent, info, ahead)))
         self.note(text)
         if not self._bar.console.is_terminal:
-            self._bar.console.print(text, soft_wrap=True, markup=False)
+            _print(self._bar.console, text)
 
     def note(self, text: str) -> None:
-        """Write lines to the log only, if there is one."""
+        """Write a line to the log only, if there is one."""
         if self._log is not None:
-            for line in text.splitlines():
-                self._log.handle(logging.makeLogRecord({"msg": line}))
+            self._log.handle(logging.makeLogRecord({"msg": text}))
+
+
+def _print(console: Console, text: str) -> None:
+    console.print(printable(text), soft_wrap=True, markup=False)
 
 
 def _opened(path: Path) -> logging.Handler:
@@ -194,5 +198,6 @@ def _opened(path: Path) -> logging.Handler:
     except OSError as error:
         raise OutputError(f"{path} cannot be written ({error.strerror}).") from None
     log.setLevel(logging.INFO)
+    escape_records(log)
     log.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
     return log

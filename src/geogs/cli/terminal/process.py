@@ -16,6 +16,7 @@ from types import FrameType
 from typing import TextIO
 
 from geogs.application.interrupt import handled_signals, interrupt
+from geogs.terminal_text import escape_records
 
 
 def take_over() -> None:
@@ -64,6 +65,7 @@ def show_warnings() -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("warning: %(message)s"))
     handler.setLevel(logging.WARNING)
+    escape_records(handler)
     log = logging.getLogger("geogs")
     log.handlers[:] = [handler]
     log.propagate = False

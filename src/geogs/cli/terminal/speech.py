@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from geogs.application.run_settings import RunSettings, Verbosity
 from geogs.errors import TrackingLost
+from geogs.terminal_text import say
 
 if TYPE_CHECKING:
     from geogs.application.progress.run_progress import RunProgress
@@ -28,7 +29,7 @@ def say_loading(options: Verbosity) -> None:
 
 def say_input(source: "Source | PosedSource") -> None:
     """Print what an input holds and how it is read, for ``--dry-run``."""
-    print("\n".join(source.account.lines(source.found)))
+    say(*source.account.lines(source.found))
 
 
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "Result":
@@ -56,9 +57,10 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "
             took = result.scene.stopwatch.total
             said = remedy(options, result.source, result.verdict, took)
             words += [f"What may help: {said}"] if said else []
-        progress.note("\n".join(words))
+        for line in words:
+            progress.note(line)
     if not options.quiet:
-        print("\n".join(words))
+        say(*words)
     if result.mesh is None and not result.is_interrupted:
         why = result.why_no_map or "Of what was seen no surface is known."
         raise TrackingLost(f"There is no mesh; the rest is in {result.folder}/. {why}")
