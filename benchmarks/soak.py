@@ -141,7 +141,7 @@ class Soak:
             after = max(dice.uniform(0.0, 1.0) * seconds, STARTED)
             ending = self._ended(command, number, after, dice.choice(("1", "2", "3")))
             # A signal during Python's shutdown, or during an exec, ends Python itself.
-            wrong += ending.wrong((0, 2, 130, -number) if number else (0, 2))
+            wrong += ending.wrong((0, 2, 128 + number, -number) if number else (0, 2))
             is_open = (out / "checkpoint" / "manifest.json").is_file()
             if wrong or ((number is None or not ending.was_hit) and not is_open):
                 return ending, wrong

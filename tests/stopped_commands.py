@@ -56,6 +56,6 @@ def stop(
     command += [",".join(map(str, counts)), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1800, cwd=cwd)
     said = done.stdout + done.stderr
-    code = 0 if number == signal.SIGINT else -number
+    code = -number if number == signal.SIGKILL else 128 + number
     assert re.findall(r"exit code (\S+)", done.stdout) == [str(int(code))] * len(counts), said
     return " ".join(said.split())

@@ -255,9 +255,11 @@ def full(*_: object, **__: object) -> None:
 
 
 @pytest.mark.usefixtures("no_report")
-def test_interrupting_keeps_what_there_is(small_room, tmp_path, monkeypatch, capsys):
-    at_frame_24(monkeypatch, lambda: signal.raise_signal(signal.SIGINT))
-    assert run_small(small_room, tmp_path) == 0
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupting_keeps_what_there_is(number, small_room, tmp_path, monkeypatch, capsys):
+    """And `geogs run … && next` does not go on: the exit code is the signal's."""
+    at_frame_24(monkeypatch, lambda: signal.raise_signal(number))
+    assert run_small(small_room, tmp_path) == 128 + number
     assert "Stopping early; keeping what there is." in capsys.readouterr().err
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["interrupted"] is True

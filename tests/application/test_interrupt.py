@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from geogs.application.checkpoints.run_state import RunMetadata
-from geogs.application.interrupt import Interruption
+from geogs.application.interrupt import Interrupted, Interruption
 from geogs.application.machine.device import gpu_errors_in_a_sentence
 from geogs.application.run import continued
 from geogs.application.run_settings import RunSettings
@@ -26,9 +26,28 @@ def test_the_first_signal_asks_and_the_second_quits(first, second):
     with Interruption() as stop:
         os.kill(os.getpid(), first)
         assert stop.requested
-        with pytest.raises(KeyboardInterrupt):
+        assert stop.code == 128 + first
+        with pytest.raises(Interrupted) as quits:
             os.kill(os.getpid(), second)
+        assert quits.value.code == 128 + second
     assert [signal.getsignal(n) for n in SIGNALS] == before
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_work_that_stops_at_a_safe_point_ends_with_the_code_of_the_signal(number):
+    stop = Interruption()
+
+    def work() -> None:
+        with stop, gpu_errors_in_a_sentence(lambda: WAY):
+            os.kill(os.getpid(), number)
+            stop.check()
+
+    with pytest.raises(Interrupted) as ended:
+        work()
+    assert ended.value.code == 128 + number
+    assert str(ended.value) == WAY.strip()
+    with stop:
+        assert stop.code == 130, "of the signals in this block there is none"
 
 
 def test_a_signal_that_is_ignored_asks_for_nothing():

@@ -17,8 +17,17 @@ def handled_signals() -> list[signal.Signals]:
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
-def interrupt(number: int, frame: FrameType | None) -> None:
-    """Handle a signal: raise KeyboardInterrupt; during an import, as soon as that is done.
+class Interrupted(KeyboardInterrupt):
+    """The end of a process by a signal."""
+
+    def __init__(self, code: int, *words: object) -> None:
+        super().__init__(*words)
+        self.code = code
+        """Exit code, as in shells: 128 and the number of the signal."""
+
+
+def interrupt(number: int, frame: FrameType | None, is_retry: bool = False) -> None:
+    """Handle a signal: raise Interrupted; during an import, as soon as that is done.
 
     A half-imported module makes others fail with any error. Another signal during an import ends
     the process only where the import seems to hang: an end at once would leave unfinished work
@@ -27,13 +36,13 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     is_waiting, left = signal.getitimer(signal.ITIMER_REAL)
     if not _is_importing(frame):
         signal.setitimer(signal.ITIMER_REAL, 0)
-        raise KeyboardInterrupt
+        raise Interrupted(128 + number)
     # The timer's interval, which is never reached, stores the time left for the import.
     # After five seconds an import counts as hanging.
     left = max(left - _RETRY_SECONDS, _RETRY_SECONDS) if is_waiting or left else 5.0
-    if number in SIGNALS and left <= _RETRY_SECONDS:
+    if not is_retry and left <= _RETRY_SECONDS:
         os._exit(128 + number)
-    signal.signal(signal.SIGALRM, interrupt)
+    signal.signal(signal.SIGALRM, lambda _, frame: interrupt(number, frame, is_retry=True))
     signal.setitimer(signal.ITIMER_REAL, _RETRY_SECONDS, left)
 
 
@@ -49,6 +58,8 @@ class Stop:
     """A request to stop, which no signal makes here. It may be entered repeatedly."""
 
     requested = False
+    code = 128 + signal.SIGINT
+    """Exit code of a command that was stopped."""
 
     def __enter__(self) -> "Stop":
         self.requested = False
@@ -86,6 +97,7 @@ class Interruption(Stop):
 
     def __enter__(self) -> "Interruption":
         super().__enter__()
+        self.code = Stop.code
         # Python handles signals in the main thread only.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
@@ -96,8 +108,12 @@ class Interruption(Stop):
         if self._is_listening:
             for number, before in self._before.items():
                 signal.signal(number, before)
+        error = exception[1]
+        if self.requested and type(error) is KeyboardInterrupt:  # at a safe point
+            raise Interrupted(self.code, *error.args) from error
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
             interrupt(number, frame)
         self.requested = True
+        self.code = 128 + number

@@ -21,7 +21,7 @@ from geogs.version import __version__
 EXIT_ERROR = 2
 """Exit code after an error that the user can fix."""
 EXIT_INTERRUPTED = 130
-"""Exit code after Ctrl-C, as in shells (128 + SIGINT)."""
+"""Exit code after Ctrl-C where no handler of ours gave one, as in shells (128 + SIGINT)."""
 _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN error", "NVRTC")
 """Beginnings of PyTorch's errors that no command has translated."""
 _UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EIO, errno.ESTALE, errno.EROFS)
@@ -34,7 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``geogs`` with the given arguments (those of the process if none).
 
     Returns:
-        0 on success, 2 after an error of input, output or options, 130 after Ctrl-C.
+        0 on success, 2 after an error of input, output or options, 130 after Ctrl-C and 143 after
+        SIGTERM, also where a result of the work so far was written.
     """
     if argv is not None:
         return _guarded(lambda: _dispatch(list(argv)))
@@ -103,7 +104,7 @@ def _guarded(run: Callable[[], int]) -> int:
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_ERROR
     except KeyboardInterrupt as interrupt:
         print_error(" ".join(["interrupted.", *map(str, interrupt.args)]).strip())
-        return EXIT_INTERRUPTED
+        return getattr(interrupt, "code", EXIT_INTERRUPTED)
     except Exception as error:
         sentence = str(error) if isinstance(error, GeogsError) else _resource_error(error)
         if sentence is None or os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):

@@ -48,12 +48,11 @@ def main(argv: Sequence[str]) -> int:
 
     # The budget counts from the start of the command.
     settings = replace(settings, budget=left_of(settings.budget, begin))
-    result = followed(
-        options, lambda progress: reconstruct_to_folder(settings, progress, Interruption())
-    )
+    stop = Interruption()
+    result = followed(options, lambda progress: reconstruct_to_folder(settings, progress, stop))
     if result.can_resume:
         say("The same command with --resume goes on from here.")
-    return 0
+    return stop.code if result.is_interrupted else 0
 
 
 def parse(argv: Sequence[str]) -> ReconstructOptions:

@@ -83,7 +83,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
         result = followed(options, lambda progress: go(settings, progress, stop, observer))
     if result.can_resume:
         say(f"geogs run --resume {result.folder} goes on from here.")
-    return 0
+    return stop.code if result.is_interrupted else 0
 
 
 def _observer(options: LiveSettings) -> "RunObserver | None":

@@ -41,8 +41,9 @@ def gpu_errors_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]:
     except torch.cuda.OutOfMemoryError as error:
         raise DeviceError(f"The memory of the GPU is full; {REMEDY}.{way_on()}") from error
     except KeyboardInterrupt as interrupt:
-        way = way_on().strip()
-        raise KeyboardInterrupt(*((way,) if way else interrupt.args)) from None
+        if way := way_on().strip():
+            interrupt.args = (way,)
+        raise
     except RuntimeError as error:
         if not is_gpu_failure(error):
             raise
