@@ -7,12 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from geogs.checked_arguments import checks_arguments
 from geogs.config import Config
+from geogs.entrance import Entrance, changes_system
 from geogs.errors import InputError
 from geogs.executors.in_order import Deferred, InOrder
 from geogs.executors.live import Live, urgent_stream
 from geogs.geometry.camera import Camera
-from geogs.geometry.given_pose import as_pose
 from geogs.gpu.installation import require_device
 from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
@@ -20,6 +21,7 @@ from geogs.mapping.mapper import Mapper
 from geogs.pose_estimate import PoseEstimate
 from geogs.priors.monocular_prior import MonocularPrior
 from geogs.scene_mask import SceneMask
+from geogs.slam_input import input_frame, require_camera, require_mask
 from geogs.slam_output import SlamOutput
 from geogs.stopwatch import StageProgress, Stopwatch, unwatched
 from geogs.threads import on_one_torch_thread
@@ -40,11 +42,13 @@ class Slam(SlamOutput):
     where frames come with sensor depth.
     """
 
+    @checks_arguments
+    @on_one_torch_thread
     def __init__(
         self,
         camera: Camera,
         config: Config | None = None,
-        device: str = "auto",
+        device: str | torch.device = "auto",
         prior: MonocularPrior | None = None,
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
@@ -74,6 +78,9 @@ class Slam(SlamOutput):
                 world belongs to another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
+        self.entrance = Entrance()
+        require_camera(camera)
+        require_mask(mask, camera)
         self.config = c = config or Config()
         maps_at_end = defers_map and not live and c.mapping.may_follow
         self.world = world or World(maps_at_end=maps_at_end)
@@ -101,16 +108,35 @@ class Slam(SlamOutput):
         self.pose: PoseEstimate | None = None
         """Estimate after the last frame; None before the first."""
 
+    @changes_system
     @on_one_torch_thread
     def process(
         self, image: Frame | np.ndarray | torch.Tensor, timestamp: float | None = None
     ) -> PoseEstimate:
-        """Process the next image, see :func:`input_frame`; return the camera's pose."""
+        """Estimate the pose of the camera at the next image; make keyframes and map of it.
+
+        Ctrl-C in a program without a handler of its own waits for the end of the image.
+
+        Args:
+            image: RGB, uint8, height x width x 3, undistorted, of the camera's size, as an array
+                or a tensor; or a :class:`geogs.Frame`, which has its own timestamp.
+            timestamp: seconds, later than that of the image before; without it images come 30
+                times a second.
+
+        Returns:
+            The pose, world to camera (``T_cw``), float64, in map units; none while the camera is
+            not tracked in the main map. ``state`` says why.
+
+        Raises:
+            InputError: the image or its time cannot be used, the stream has ended by
+                :meth:`finish`, or another thread or process is at work in this system. Nothing
+                has changed then.
+        """
         world = self.world
         if world.is_ended:
             raise InputError("The stream has ended by finish(); save it, and load it to go on.")
         frame = input_frame(image, timestamp, self.camera, world.frames, world.timestamp)
-        with self.executor.frame():
+        with self.entrance.image(), self.executor.frame():
             state = self.executor.track(frame, self.loops.recognise, self._advance)
             world.frames = world.frames + 1
             world.timestamp = frame.timestamp
@@ -137,6 +163,7 @@ class Slam(SlamOutput):
             with self.stopwatch("map update"):
                 self.executor.mapping.correct(correction)
 
+    @changes_system
     @on_one_torch_thread
     def end_stream(self) -> None:
         """Map the remaining keyframes after the last frame. This is the online result."""
@@ -155,6 +182,7 @@ class Slam(SlamOutput):
         if not self.executor.maps_at_end:  # else there is no online result
             self.stopwatch.end_stream()
 
+    @changes_system
     @on_one_torch_thread
     def adjust(self, progress: StageProgress = unwatched) -> None:
         """Bundle-adjust all keyframes and correct the map."""
@@ -170,6 +198,7 @@ class Slam(SlamOutput):
         self.world.adjusted = len(main.segment.ids)
         self._update_map()
 
+    @changes_system
     @on_one_torch_thread
     def refine(self, progress: StageProgress = unwatched, seconds: float | None = None) -> None:
         """Train the map over all keyframes, or make it from them where it was deferred.
@@ -180,6 +209,7 @@ class Slam(SlamOutput):
         self.executor.refine(self.world.unmapped, partial(progress, label), seconds)
         self.world.is_refined = self.will_refine and seconds is None
 
+    @changes_system
     @on_one_torch_thread
     def finish(self, progress: StageProgress = unwatched, correct: bool = True) -> None:
         """End the stream if needed, adjust all keyframes, refine the map, convert it to metres.
@@ -193,6 +223,7 @@ class Slam(SlamOutput):
             self.refine(progress)
         self.to_metres()
 
+    @changes_system
     @on_one_torch_thread
     def place_found(self, found: FoundFrames) -> None:
         """Insert lost frames that were relocalised."""
@@ -200,6 +231,7 @@ class Slam(SlamOutput):
         if self.world.uncertainty is not None:
             self.world.uncertainty = self.world.uncertainty.with_found(found)
 
+    @changes_system
     @on_one_torch_thread
     def rescale(self, scale: MetricScale) -> None:
         """Convert all lengths of poses, depths and map to metres."""
@@ -235,66 +267,3 @@ def scale_by_odometry(main: Tracker) -> MetricScale | None:
     scale = found.scale
     found.scale = 1.0
     return MetricScale("poses beside the images", scale, drift)
-
-
-def input_frame(
-    image: Frame | np.ndarray | torch.Tensor,
-    timestamp: float | None,
-    camera: Camera,
-    index: int,
-    previous: float | None,
-) -> Frame:
-    """Make a frame from an image.
-
-    Args:
-        image: RGB, uint8, undistorted, of the camera's size; or a frame of a source, which has
-            checked it.
-        timestamp: seconds, later than ``previous``, the last frame's; ignored for a frame, which
-            has its own. If None, images come 30 times a second.
-        index: position in the stream.
-
-    Raises InputError if the image cannot be used.
-    """
-    if isinstance(image, Frame):
-        if image.pose is None:
-            return image
-        return replace(image, pose=replace(image.pose, T_cw=as_pose(image.pose.T_cw)))
-    if isinstance(image, torch.Tensor):
-        image = image.cpu().numpy()
-    if timestamp is None:
-        seconds = 0.0 if previous is None else previous + 1 / 30
-    else:
-        seconds = float(timestamp)
-    check_image(image, camera)
-    if not np.isfinite(seconds):
-        raise InputError("The time of an image is a finite number of seconds.")
-    if previous is not None and seconds <= previous:
-        raise InputError(
-            f"The image is of {seconds:g} s, the one before of {previous:g} s; times have to "
-            "increase."
-        )
-    return Frame(index, seconds, image)
-
-
-def check_image(image: object, camera: Camera) -> None:
-    """Raise InputError if something is no RGB image of a camera's size."""
-    if not isinstance(image, np.ndarray):
-        raise InputError("An image is an array, uint8 of height x width x 3 (RGB).")
-    if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
-        raise InputError(
-            "The image is grey; give RGB, as of cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)."
-        )
-    if image.ndim != 3 or image.shape[2] != 3:
-        shape = "x".join(map(str, image.shape))
-        raise InputError(f"The image is an array of {shape}; give height x width x 3 (RGB).")
-    if image.dtype != np.uint8:
-        raise InputError(
-            f"The image is of {image.dtype}; give uint8 in 0..255, as of "
-            "(255 * image).round().astype(numpy.uint8) where it is in 0..1."
-        )
-    if image.shape[:2] != (camera.height, camera.width):
-        height, width = image.shape[:2]
-        raise InputError(
-            f"The image is {width} x {height} pixels, the camera {camera.width} x "
-            f"{camera.height}; all images must have the camera's size."
-        )

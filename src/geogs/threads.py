@@ -13,8 +13,10 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import ParamSpec, Protocol, TypeVar, runtime_checkable
 
+import numpy as np
 import torch
 
 T = TypeVar("T")
@@ -145,16 +147,25 @@ def _executor(threads: int, process: int) -> ThreadPoolExecutor:
 
 
 def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Limit PyTorch to one thread while the decorated function runs."""
+    """Limit PyTorch to one thread while the decorated function runs.
+
+    Settings of the caller that would change what is computed are suspended, too: another default
+    dtype than float32, PyTorch's inference mode, and NumPy's errors as exceptions.
+    """
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
-        before = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with ExitStack() as settings:
+            settings.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(1)
+            if torch.get_default_dtype() != torch.float32:
+                settings.callback(torch.set_default_dtype, torch.get_default_dtype())
+                torch.set_default_dtype(torch.float32)
+            if torch.is_inference_mode_enabled():
+                settings.enter_context(torch.inference_mode(False))
+            if "raise" in np.geterr().values():
+                settings.enter_context(np.errstate(all="warn", under="ignore"))
             return function(*args, **kwargs)
-        finally:
-            torch.set_num_threads(before)
 
     return wrapped
 

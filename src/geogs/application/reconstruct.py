@@ -26,6 +26,7 @@ from geogs.application.results.result import Result
 from geogs.application.results.surfaces import Snapshots
 from geogs.application.run_settings import ReconstructSettings
 from geogs.application.structure_from_motion.photos import open_photographs
+from geogs.checked_arguments import checks_arguments
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded
@@ -59,11 +60,12 @@ def _compiled(
     return compile_gpu_kernels(device) + kernels.wait(progress.stage)
 
 
+@checks_arguments
 @on_one_torch_thread
 def reconstruct(
     source: str | Path | PosedSource,
     config: ReconstructConfig | None = None,
-    device: str = "auto",
+    device: str | torch.device = "auto",
     budget: float | None = None,
     *,
     poses: Literal["given", "auto"] = "given",

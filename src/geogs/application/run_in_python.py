@@ -3,29 +3,37 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.result import Result
 from geogs.application.run import run as run_to_folder
 from geogs.application.run_settings import RunSettings
-from geogs.config import Config, preset
+from geogs.checked_arguments import checks_arguments
+from geogs.config import Config, Preset
+from geogs.config import preset as preset_config
+from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu
 
 
+@checks_arguments
 def run(
     source: str | Path | Sequence[str | Path],
     config: Config | None = None,
     output: str | Path | None = None,
-    device: str = "auto",
+    device: str | torch.device = "auto",
     *,
+    preset: Preset = "default",
     progress: RunProgress | None = None,
 ) -> Result:
     """Do all of ``geogs run``, with its files, silently. Returns the result.
 
     Args:
         source: a video, a folder, a data set, a bag, or several of one scene.
-        config: all settings; the preset ``default`` for the device if none.
+        config: all settings; without them those of the ``preset``, for the device.
         output: folder of the result; out/NAME if none is given, see ``Result.folder``.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
+        preset: fast, default, accurate or paper; for settings beside it give a ``config``.
         progress: follows the work.
 
     Raises:
@@ -36,6 +44,9 @@ def run(
     """
     several = (source,) if isinstance(source, str | Path) else source
     folder = None if output is None else Path(output)
-    config = config or preset("default", is_gpu(device))
-    settings = RunSettings(tuple(map(Path, several)), config, folder, device)
+    if config is not None and preset != "default":
+        raise InputError("A config has all settings; leave out either config or preset.")
+    on_gpu = preset == "default" and is_gpu(str(device))
+    config = config or preset_config(preset, on_gpu)
+    settings = RunSettings(tuple(map(Path, several)), config, folder, str(device))
     return run_to_folder(settings, progress)

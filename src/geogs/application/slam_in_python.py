@@ -14,6 +14,7 @@ from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.write import write_config
+from geogs.checked_arguments import checks_arguments
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
@@ -33,10 +34,11 @@ from geogs.tracking.keyframes.segment_map import add_saved_keyframes
 from geogs.world.world import World
 
 
+@checks_arguments
 def track(
     source: str | Path | Sequence[str | Path] | Source,
     config: Config | None = None,
-    device: str = "auto",
+    device: str | torch.device = "auto",
     slam: Slam | None = None,
 ) -> Iterator[PoseEstimate]:
     """Yield the camera's pose after each frame of a video, a folder, a camera or a stream.
@@ -108,10 +110,11 @@ def go_on_in(slam: Slam, saved: SavedResult) -> None:
         slam.executor.mapping.take_over(saved.disks, masks, ids)
 
 
+@checks_arguments
 def load_slam(
     folder: str | Path,
     config: Config | None = None,
-    device: str = "auto",
+    device: str | torch.device = "auto",
     live: bool = False,
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Slam:
@@ -130,6 +133,7 @@ def load_slam(
     return slam
 
 
+@checks_arguments
 @on_one_torch_thread
 def save_slam(slam: Slam, folder: str | Path) -> Path:
     """Save the present map for :func:`load_slam` and ``geogs.load_result``. Returns the folder.
@@ -158,6 +162,7 @@ def save_slam(slam: Slam, folder: str | Path) -> Path:
     return output
 
 
+@checks_arguments
 def slam_mesh(slam: Slam) -> Mesh | None:
     """The surface of the present map; none where there is none yet."""
     renders = slam.renders()

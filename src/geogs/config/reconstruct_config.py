@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
 
+from geogs.checked_arguments import checks_arguments
 from geogs.config.input_config import InputConfig
 from geogs.config.loss_config import LossConfig
 from geogs.config.mapping_config import DepthConfig, MappingConfig, PhotoConfig
@@ -68,6 +69,7 @@ class ReconstructConfig(Settings):
     mesh: MeshConfig = field(default_factory=partial(MeshConfig, detail=0.5))
 
 
+@checks_arguments
 def reconstruct_preset(name: Preset) -> ReconstructConfig:
     """The settings of a preset for known poses.
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, get_args
 
+from geogs.checked_arguments import checks_arguments
 from geogs.config.input_config import InputConfig
 from geogs.config.mapping_config import MappingConfig
 from geogs.config.mesh_config import MeshConfig
@@ -56,6 +57,7 @@ def _values(settings: Settings) -> list[object]:
     return found
 
 
+@checks_arguments
 def preset(name: Preset, on_gpu: bool = False) -> Config:
     """The settings of a preset.
 

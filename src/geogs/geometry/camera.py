@@ -32,6 +32,20 @@ class Camera:
     k1: float = 0.0
     k2: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Raises InputError for numbers that are none of a camera."""
+        try:
+            is_finite = all(map(math.isfinite, self.numbers))
+            is_image = all(n >= 1 and float(n).is_integer() for n in (self.width, self.height))
+        except (TypeError, ValueError):
+            is_finite = is_image = False
+        if not (is_finite and is_image and self.fx > 0 and self.fy > 0):
+            raise InputError(
+                f"There is no camera with fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy}, "
+                f"k1 {self.k1} and k2 {self.k2} for images of {self.width} x {self.height}; focal "
+                "lengths and sizes are positive, all numbers finite."
+            )
+
     @property
     def long_edge(self) -> int:
         """Pixels along the longer side of the image."""
@@ -80,7 +94,12 @@ class Camera:
         return replace(self, fx=focal, fy=focal * self.fy / self.fx)
 
     def with_field_of_view(self, degrees: float) -> "Camera":
-        """Return the camera with this field of view along its longer side."""
+        """Return the camera with this field of view along its longer side.
+
+        Raises InputError unless it is above 0 and below 180 degrees.
+        """
+        if not 0 < degrees < 180:
+            raise InputError(f"No lens sees {degrees:g} degrees; give more than 0 and below 180.")
         return self.with_focal(self.long_edge / 2 / math.tan(math.radians(degrees / 2)))
 
     def moved(

@@ -71,11 +71,12 @@ def gpu_problem() -> str | None:
     )
 
 
-def require_device(name: str) -> torch.device:
+def require_device(device: str | torch.device) -> torch.device:
     """The device named ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` is a GPU where one can be used.
 
     Raises DeviceError if the device cannot be used.
     """
+    name = str(device)
     if name == "auto":
         name = "cpu" if gpu_problem() else "cuda"
     try:

@@ -192,7 +192,7 @@ class Segments:
                     self._drop(tracker)
                     continue
                 oriented = tracker.trajectory().oriented
-                if oriented is None or oriented.mean() < MIN_ORIENTED:
+                if oriented is None or not len(oriented) or oriented.mean() < MIN_ORIENTED:
                     raise
                 self.table.why_not = str(reason)
                 return TrackResult(tracker.segment.status.state)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, UInt8
 
 from geogs.application.results.output_folder import claimed, read_summary
 from geogs.camera.shutter.rows import CELL
+from geogs.checked_arguments import checks_arguments
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -189,6 +190,8 @@ class SavedResult:
         return RenderedKeyframe(id, self.depth_camera, T_cw, *maps, image, seconds, mask)
 
 
+@checks_arguments
+@on_one_torch_thread
 def load_result(folder: str | Path, device: torch.device | str = "cpu") -> SavedResult:
     """Read a result from its folder; the map goes to ``device``, where it is rendered.
 

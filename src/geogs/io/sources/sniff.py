@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from geogs.checked_arguments import checks_arguments
 from geogs.config import InputConfig
 from geogs.documents import expanded
 from geogs.errors import InputError
@@ -63,6 +64,7 @@ _POSED_LAYOUTS = tuple(layout for layout in LAYOUTS if layout.posed)
 _log = logging.getLogger(__name__)
 
 
+@checks_arguments
 def open_source(
     path: str | Path | Sequence[str | Path], config: InputConfig | None = None
 ) -> Source:
@@ -147,6 +149,7 @@ def _folder_reader(folder: Path, wants_poses: bool) -> Reader:
     return nerfstudio.with_transforms(images, folder) if wants_poses else images
 
 
+@checks_arguments
 def open_posed_source(
     path: str | Path, config: InputConfig | None = None, hold_out: int | None = None
 ) -> PosedSource:

@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from geogs.checked_arguments import checks_arguments
 from geogs.documents import UNUSABLE, require_file
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -74,6 +75,7 @@ def _write(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
         stream.write(data[end:])
 
 
+@checks_arguments
 def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapshot:
     """Read the disks of a map, in the world.
 

@@ -168,6 +168,7 @@ class CpuTrainer:
         self._bound_scales()
         return total
 
+    @torch.enable_grad()
     def _pass(self, view: MapView, partners: list[MapView], coarse: bool) -> _Pass:
         """Forward and backward pass of one view; changes nothing that other views use."""
         parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))

@@ -46,6 +46,7 @@ Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
 """The loss of some poses, and a differentiable scalar with the same gradient."""
 
 
+@torch.enable_grad()
 def descend(
     start: Float[Tensor, "k 4 4"], config: MappingConfig, unit: float, evaluate: Evaluate
 ) -> Float[Tensor, "k 4 4"]:
