@@ -42,7 +42,8 @@ class Fault:
     def _is_below(self, event: str, arguments: tuple[object, ...]) -> bool:
         if event == "open" and not (isinstance(arguments[2], int) and arguments[2] & _WRITING):
             return False
-        path = os.fspath(arguments[0]) if isinstance(arguments[0], str | os.PathLike) else ""
+        is_path = isinstance(arguments[0], str | os.PathLike)
+        path = os.path.realpath(arguments[0]) if is_path else ""  # some lead by a handle
         by_handle = event not in ("open", "os.fsync") and arguments[-1] != -1
         return by_handle or event == "os.fsync" or path.startswith(str(self.folder))
 

@@ -36,7 +36,7 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 def check_fields(record: object) -> None:
     """Raise InputError if a field of a dataclass is not what its annotation says."""
-    kind = type(record)
+    kind: type[Any] = type(record)
     for field, hint in _fields(kind).items():
         _check(f"{kind.__name__}: {field}", getattr(record, field), hint)
 
@@ -63,8 +63,9 @@ def _fits(value: object, hint: Any) -> bool:
     if origin is Annotated:
         return _fits(value, inner[0])
     if origin is Sequence:
-        is_several = isinstance(value, Sequence) and not isinstance(value, str)
-        return is_several and all(_fits(part, inner[0]) for part in value)
+        if not isinstance(value, Sequence) or isinstance(value, str):
+            return False
+        return all(_fits(part, inner[0]) for part in value)
     if hint in _NUMBERS:
         return isinstance(value, _NUMBERS[hint]) and not isinstance(value, bool)
     is_class = isinstance(hint, type) and origin is None and hint is not Any

@@ -1,5 +1,6 @@
 """Files take their places together; no link is followed, and nothing foreign is deleted."""
 
+import errno
 import json
 import os
 import shutil
@@ -9,9 +10,9 @@ import pytest
 
 from disk_faults import contents, every_fault, full_disk, kill
 from geogs.errors import OutputError
-from geogs.io.writers.atomic import write_text
+from geogs.io.writers.atomic import prepare_output_folder, unwritable, write_text
 from geogs.io.writers.directory import Directory
-from geogs.io.writers.replacement import LIST, is_half_done, recover, replaced
+from geogs.io.writers.replacement import _FILES, LIST, is_half_done, recover, replaced
 
 OLD = {"mesh.ply": "old mesh", "keyframes/000001.jpg": "a", "keyframes/000002.jpg": "b"}
 NEW = {"mesh.ply": "new mesh", "keyframes/000001.jpg": "c", "report/index.html": "page"}
@@ -59,7 +60,7 @@ def test_what_an_error_ends_leaves_all_as_it_was(tmp_path):
         write(tmp_path, NEW)
     (tmp_path / "report").unlink()
     (tmp_path / "summary.json").mkdir()
-    with pytest.raises(OutputError, match="json is a folder; a file is to be there"):
+    with pytest.raises(OutputError, match="json is a folder, and a file is to be there"):
         write(tmp_path, {**NEW, "summary.json": "{}"}, "part")
     (tmp_path / "summary.json").rmdir()
     assert contents(tmp_path) == before
@@ -177,3 +178,63 @@ def test_a_process_that_is_killed_leaves_old_or_new_to_the_next(tmp_path, what):
 def shown(files: dict[str, bytes]) -> dict[str, bytes]:
     """Those that other programs see."""
     return {name: data for name, data in files.items() if not name.startswith(".geogs.")}
+
+
+@pytest.mark.parametrize("what", ["result", "part", "beside"])
+@pytest.mark.parametrize("when", ["at first", "between", "at last"])
+def test_a_folder_that_is_swapped_for_a_link_keeps_its_files(tmp_path, what, when):
+    out = tmp_path / "out"
+    elsewhere = tmp_path / "elsewhere"
+    for folder in (out, elsewhere):
+        folder.mkdir()
+    (elsewhere / "mesh.ply").write_text("of somebody else")
+
+    def swap(moment: str) -> None:
+        if moment == when:
+            out.rename(tmp_path / "moved")
+            out.symlink_to(elsewhere)
+
+    def work() -> None:
+        with replaced(out, what) as new:
+            swap("at first")
+            write_text(new / "keyframes/000001.jpg", "c")
+            swap("between")
+            write_text(new / "mesh.ply", "new mesh")
+            swap("at last")
+
+    with pytest.raises(OutputError, match=f"another folder.*the files are in {tmp_path}/moved"):
+        work()
+    assert texts(elsewhere) == {"mesh.ply": "of somebody else"}
+    assert texts(tmp_path / "moved") == {"mesh.ply": "new mesh", "keyframes/000001.jpg": "c"}
+    assert not list(elsewhere.glob(".geogs*"))
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "summary.json", "trajectory.tum", "splats.ply"])
+def test_folders_with_the_names_of_files_are_refused_before_the_work(tmp_path, name):
+    (tmp_path / name).mkdir()
+    refused = pytest.raises(OutputError, match=f"{name} is a folder, and a file is to be there")
+    with refused, replaced(tmp_path, "result"):
+        raise AssertionError("the work has begun")
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_the_files_that_are_looked_at_are_those_of_results():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text()
+    assert [name for name in _FILES if f"`{name}`" not in page] == []
+
+
+@pytest.mark.parametrize("name", ["out", "a/b/out"])
+def test_a_link_that_leads_nowhere_is_named_with_what_it_names(tmp_path, name):
+    link = tmp_path / name
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(tmp_path / "not there")
+    with pytest.raises(OutputError, match=f"is a link to {tmp_path}/not there, which does not"):
+        prepare_output_folder(link)
+    assert not (tmp_path / "not there").exists()
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE])
+def test_where_too_many_files_are_open_another_folder_is_no_remedy(number):
+    said = str(unwritable(Path("out"), OSError(number, os.strerror(number))))
+    assert said.endswith("raise the limit of open files (ulimit -n).")
+    assert "another" not in said

@@ -382,6 +382,8 @@ class WorkingImages:
         """Message where all images were skipped, or there are none."""
         if skipped:
             return f"{self.name}: none of its {skipped} images can be used."
+        if not self._config.start:
+            return f"{self.name} ended before its first image."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."
 
 

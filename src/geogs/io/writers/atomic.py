@@ -13,7 +13,6 @@ from geogs.documents import expanded
 from geogs.errors import OutputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-_ELSEWHERE = "give another output folder"
 
 
 @contextmanager
@@ -60,6 +59,11 @@ def prepare_output_folder(path: str | Path) -> Path:
     folder = expanded(path)
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; give another folder for the results.")
+    if folder.is_symlink() and not folder.exists():
+        raise OutputError(
+            f"{folder} is a link to {os.readlink(folder)}, which does not exist; make that folder, "
+            "or give another one for the results."
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=folder):
@@ -70,7 +74,11 @@ def prepare_output_folder(path: str | Path) -> Path:
 
 def unwritable(path: Path, error: OSError) -> OutputError:
     """The error to raise where a file or folder cannot be written."""
-    remedy = f"free some space on {_disk_of(path)}" if error.errno in _FULL else _ELSEWHERE
+    remedy = "give another output folder"
+    if error.errno in _FULL:
+        remedy = f"free some space on {_disk_of(path)}"
+    elif error.errno in (errno.EMFILE, errno.ENFILE):
+        remedy = "raise the limit of open files (ulimit -n)"
     return OutputError(f"{path} cannot be written ({error.strerror or error}); {remedy}.")
 
 

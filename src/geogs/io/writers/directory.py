@@ -37,6 +37,19 @@ class Directory:
         finally:
             os.close(handle)
 
+    @property
+    def reach(self) -> Path:
+        """A path by the handle, which leads there also when another folder has got the name; the
+        path itself where the system has none."""
+        by_handle = Path(f"/proc/self/fd/{self._handle}")
+        return by_handle if by_handle.exists() else self.path
+
+    def is_at_its_path(self) -> bool:
+        """Whether its path still leads to it."""
+        with suppress(OSError):
+            return os.path.samestat(os.fstat(self._handle), os.stat(self.path))
+        return False
+
     @contextmanager
     def inner(self, name: str) -> Iterator["Directory"]:
         """A folder in this one."""

@@ -27,7 +27,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 from typing import Literal
@@ -42,6 +42,17 @@ LIST = ".geogs.json"
 _NEW = re.compile(r"\.geogs\.(\d{1,20})\.(new|ready)")
 _MARKS = ("summary.json", "map.safetensors")
 """Files of every result, which identify one without a list."""
+_FILES = (
+    *_MARKS,
+    "config.yaml",
+    "intrinsics.json",
+    "keyframes.tum",
+    "mesh.ply",
+    "splats.ply",
+    "trajectory.tum",
+    "trajectory_uncertainty.csv",
+)
+"""Files that a result may need, checked before the work begins."""
 _FOLDERS = ("adjusted", "depth_fusion", "keyframes", "online", "report", "snapshots")
 """Folders that a result may need, checked before the work begins."""
 _LARGEST_LIST = 1 << 26
@@ -56,26 +67,36 @@ later result replaces, such as exports."""
 def replaced(folder: Path, what: Extent) -> Iterator[Path]:
     """Yield a folder for new files; they move into place when the block ends without an error.
 
-    No other process may write there meanwhile. Files keep the names of the new folder.
+    No other process may write there meanwhile. Files keep the names of the new folder. All goes to
+    the folder that had the name at the beginning.
 
     Raises:
-        OutputError: something cannot be written, a link or something else is in the way, or a
-            result would replace one that has no list of its files.
+        OutputError: something cannot be written, a link or something else is in the way, a result
+            would replace one that has no list of its files, or another folder has got the name.
     """
-    with _sentence(folder), Directory.opened(folder) as place:
-        if what == "result":
-            _check(place)
-        new = _begun(place)
-    try:
-        yield folder / new
-    except BaseException as error:
-        with suppress(OSError), Directory.opened(folder) as place:
-            place.delete_all(new)
-        if isinstance(error, OutputError):  # its final path, not the temporary one
-            raise OutputError(str(error).replace(new + os.sep, "")) from error
-        raise
-    with _sentence(folder), Directory.opened(folder) as place:
-        _put_in_place(place, _committed(place, new, what))
+    with ExitStack() as handle:
+        with _sentence(folder):
+            place = handle.enter_context(Directory.opened(folder))
+            if what == "result":
+                _check(place)
+            new = _begun(place)
+        unfinished = place.reach / new
+        try:
+            yield unfinished
+        except BaseException as error:
+            with suppress(OSError):
+                place.delete_all(new)
+            if isinstance(error, OutputError):  # its final path, not the temporary one
+                final = str(error).replace(str(unfinished), str(folder))
+                raise OutputError(final.replace(new + os.sep, "")) from error
+            raise
+        with _sentence(folder):
+            _put_in_place(place, _committed(place, new, what))
+        if not place.is_at_its_path():
+            where = os.path.realpath(place.reach)
+            raise OutputError(
+                f"{folder} is another folder than at the beginning; the files are in {where}."
+            )
 
 
 def is_half_done(folder: Path) -> bool:
@@ -101,6 +122,8 @@ def recover(folder: Path) -> None:
 
 def _check(place: Directory) -> None:
     """Raise the errors of writing a whole result early."""
+    for name in _FILES:
+        _require_no_folder(place, name)
     names = place.names()
     listed = _listed(place)
     if any(mark in names and mark not in listed for mark in _MARKS):
@@ -112,6 +135,14 @@ def _check(place: Directory) -> None:
         if name in names:
             with place.inner(name):
                 pass
+
+
+def _require_no_folder(place: Directory, name: str) -> None:
+    if place.is_folder(name):
+        raise OutputError(
+            f"{place.path / name} is a folder, and a file is to be there; move it away, or give "
+            "another folder (-o)."
+        )
 
 
 def _begun(place: Directory) -> str:
@@ -138,13 +169,12 @@ def _committed(place: Directory, new: str, what: Extent) -> str:
                 own = {name: files.sha256(name) for name in files.files()}
                 listed = own if what == "result" else {**_listed(place), **own}
                 text = json.dumps({"files": listed}, indent=0, sort_keys=True)
-                write_text(files.path / LIST, text + "\n")
+                write_text(files.reach / LIST, text + "\n")
             for folder in files.folders():
                 if place.make(folder):
                     made.append(folder)
             for name in files.files():
-                if place.is_folder(name):
-                    raise OutputError(f"{place.path / name} is a folder; a file is to be there.")
+                _require_no_folder(place, name)
         ready = new.replace(".new", ".ready")
         place.move(new, place, ready)
     except BaseException:
