@@ -13,7 +13,7 @@ from geogs.application.interrupt import Interrupted, Interruption
 from geogs.application.machine.device import gpu_errors_in_a_sentence
 from geogs.application.run import continued
 from geogs.application.run_settings import RunSettings
-from geogs.errors import DeviceError, InputError
+from geogs.errors import DeviceError, InputError, TrackingLost
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WAY = " geogs run --resume out goes on."
@@ -48,6 +48,22 @@ def test_work_that_stops_at_a_safe_point_ends_with_the_code_of_the_signal(number
     assert str(ended.value) == WAY.strip()
     with stop:
         assert stop.code == 130, "of the signals in this block there is none"
+
+
+@pytest.mark.parametrize("kind", [InputError, TrackingLost])
+def test_a_source_that_was_cut_off_has_no_fault(kind):
+    def work(stop: Interruption) -> None:
+        with stop:
+            if stop is asked:
+                os.kill(os.getpid(), signal.SIGTERM)
+            raise kind("The pipe ended before its first image.")
+
+    asked = Interruption()
+    with pytest.raises(Interrupted, match="The pipe ended before its first image") as ended:
+        work(asked)
+    assert ended.value.code == 143
+    with pytest.raises(kind):
+        work(Interruption())
 
 
 def test_a_signal_that_is_ignored_asks_for_nothing():

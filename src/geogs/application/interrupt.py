@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
+from geogs.errors import InputError, TrackingLost
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals to stop: from a terminal, from schedulers, from a closed terminal."""
 _RETRY_SECONDS = 0.02
@@ -92,7 +94,8 @@ class Interruption(Stop):
     """Stop request by signals: inside, the first Ctrl-C only sets ``requested``; the second quits.
 
     SIGTERM, of systems and schedulers, has the same effect, and so has SIGHUP, of a closed
-    terminal. Ignored signals stay ignored.
+    terminal. Ignored signals stay ignored. What ends the block after a request, at a safe point or
+    as too little was read, ends it as Interrupted.
     """
 
     def __enter__(self) -> "Interruption":
@@ -109,7 +112,9 @@ class Interruption(Stop):
             for number, before in self._before.items():
                 signal.signal(number, before)
         error = exception[1]
-        if self.requested and type(error) is KeyboardInterrupt:  # at a safe point
+        is_stopped = isinstance(error, KeyboardInterrupt) and not isinstance(error, Interrupted)
+        # Of a source that was cut off there may be too little to use; that is no fault of it.
+        if self.requested and (is_stopped or isinstance(error, InputError | TrackingLost)):
             raise Interrupted(self.code, *error.args) from error
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
