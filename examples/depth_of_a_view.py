@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 import geogs
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
@@ -18,7 +19,7 @@ def main(folder: str, picture: Path = Path("depth.png")) -> float:
     """Writes the picture; returns the share of its pixels that have a depth."""
     result = geogs.load_result(folder)
     middle = len(result.keyframes) // 2
-    before, after = (result.keyframes[k].T_cw for k in (middle - 1, middle))
+    before, after = (torch.from_numpy(result.keyframes[k].T_cw) for k in (middle - 1, middle))
     T_cw = se3_exp(0.5 * se3_log(after @ se3_inverse(before))) @ before
     depth = result.render(T_cw).depth
     known = depth > 0

@@ -18,6 +18,9 @@ class OnDemand(Sequence[V], Generic[S, V]):
         self._items = items
         self._make = make
 
+    def __repr__(self) -> str:
+        return f"OnDemand({len(self)} elements)"
+
     def __len__(self) -> int:
         return len(self._items)
 

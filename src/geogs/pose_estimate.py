@@ -11,7 +11,7 @@ from geogs.tracking.locate.pose_deviation import DeviationOf, PoseDeviation
 from geogs.world.segments import TrackState
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PoseEstimate:
     """A frame's pose and the size of the map at that time.
 
@@ -29,6 +29,10 @@ class PoseEstimate:
     """World to camera; None unless the camera is tracked in the main map."""
     deviation: DeviationOf | None = field(default=None, repr=False, compare=False)
     """Function for the standard deviations of the pose; None where they are unknown."""
+
+    def __repr__(self) -> str:
+        counts = f"{self.frames} frames, {self.keyframes} keyframes, {self.disks} disks"
+        return f"PoseEstimate({self.state.value} at {self.timestamp:g} s: {counts})"
 
     @property
     def T_wc(self) -> Float64[np.ndarray, "4 4"] | None:

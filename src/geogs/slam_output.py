@@ -46,6 +46,11 @@ class SlamOutput:
     executor: InOrder
     stopwatch: Stopwatch
 
+    def __repr__(self) -> str:
+        keyframes = len(self.segments.keyframe_ids)
+        counts = f"{self.frames} frames, {keyframes} keyframes, {self.executor.disks} disks"
+        return f"{type(self).__name__}({counts})"
+
     @property
     def camera(self) -> Camera:
         """Pinhole of all images."""

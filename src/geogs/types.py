@@ -195,7 +195,7 @@ FrameState = Literal["tracked", "orientation only", "lost"]
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Trajectory(ShortRepr):
+class Trajectory:
     """Camera poses over time."""
 
     timestamps: Float[np.ndarray, "n"]
@@ -206,6 +206,9 @@ class Trajectory(ShortRepr):
     """False where the position is not known, but interpolated or repeated."""
     oriented: Bool[np.ndarray, "n"] | None = None
     """True where only the orientation is known; None where there is no such frame."""
+
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self.timestamps)} poses, {int(self.tracked.sum())} tracked)"
 
     @property
     def states(self) -> list[FrameState]:
@@ -308,7 +311,7 @@ class Uncertainty(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class MapSnapshot(ShortRepr):
+class MapSnapshot:
     """The disks of a map as plain numbers, detached from training."""
 
     position: Float[Tensor, "n 3"]
@@ -318,6 +321,9 @@ class MapSnapshot(ShortRepr):
     """Standard deviations along the two tangents, map units."""
     opacity: Float[Tensor, "n"]
     """Opacity in (0, 1)."""
+
+    def __repr__(self) -> str:
+        return f"MapSnapshot({len(self)} disks, {self.position.device})"
 
     def __len__(self) -> int:
         return len(self.position)

@@ -102,7 +102,7 @@ def go_on_in(slam: Slam, saved: SavedResult) -> None:
     if slam.frames or not saved.keyframes:
         raise InputError("A map with keyframes has to be given, and before the first frame.")
     segment = slam.segments.main.segment
-    ids = add_saved_keyframes(segment, saved.keyframes)
+    ids = add_saved_keyframes(segment, saved.renders)
     segment.status.frames_lost = slam.config.tracking.patience  # no waiting period
     slam.loops.remember(ids)
     masks = {i: m for n, i in enumerate(ids) if (m := saved.image_mask(n)) is not None}

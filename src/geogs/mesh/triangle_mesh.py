@@ -14,7 +14,6 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.creases import creased
 from geogs.mesh.tensor_mesh import TensorMesh
-from geogs.short_repr import ShortRepr
 
 if TYPE_CHECKING:
     import trimesh
@@ -46,7 +45,7 @@ class DepthMapView:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Mesh(ShortRepr):
+class Mesh:
     """Triangles in the world frame; faces turn counter-clockwise seen from free space."""
 
     vertices: Float[np.ndarray, "n 3"]
@@ -56,6 +55,10 @@ class Mesh(ShortRepr):
     """float32, unit, towards free space."""
     colours: UInt8[np.ndarray, "n 3"] | None = None
     """RGB."""
+
+    def __repr__(self) -> str:
+        colours = "without colours" if self.colours is None else "with colours"
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles, {colours})"
 
     @staticmethod
     def from_triangles(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray) -> "Mesh":

@@ -73,7 +73,7 @@ class SavedScene:
 
     @cached_property
     def _renders(self) -> list[RenderedKeyframe]:
-        return list(self._result.keyframes)
+        return list(self._result.renders)
 
     def renders(self) -> Sequence[RenderedKeyframe]:
         return self._renders

@@ -47,7 +47,7 @@ def test_every_length_is_multiplied(folder):
     units = float(np.hypot(x[1] - x[0], y[1] - y[0]))
     before = geogs.load_result(folder)
     poses, keyframe = before.trajectory.T_wc, before.keyframes[1]
-    depth, vertices = keyframe.depth.numpy(), before.mesh.vertices
+    depth, vertices = keyframe.depth, before.mesh.vertices
     splats = read_ply(folder / "splats.ply")["vertex"].columns
     known = f"0:{u[0]},{v[0]},{u[1]},{v[1]}={METRES * units}"
     found = rescale(RescaleSettings(folder, known, "cpu"))
@@ -55,7 +55,7 @@ def test_every_length_is_multiplied(folder):
     after = geogs.load_result(folder)
     np.testing.assert_allclose(after.trajectory.T_wc[:, :3, 3], found.factor * poses[:, :3, 3])
     np.testing.assert_allclose(after.trajectory.T_wc[:, :3, :3], poses[:, :3, :3], atol=1e-12)
-    np.testing.assert_allclose(after.keyframes[1].depth.numpy(), found.factor * depth, rtol=1e-4)
+    np.testing.assert_allclose(after.keyframes[1].depth, found.factor * depth, rtol=1e-4)
     np.testing.assert_allclose(after.mesh.vertices, found.factor * vertices, rtol=1e-5)
     scaled = read_ply(folder / "splats.ply")["vertex"].columns
     np.testing.assert_allclose(scaled["x"], found.factor * splats["x"], rtol=1e-4, atol=1e-4)
@@ -91,7 +91,7 @@ def test_the_mesh_lies_on_the_planes_and_is_read_as_it_was_made(tmp_path):
     path = remesh(RemeshSettings(folder, FINE, device="cpu"))
     assert path == folder / "mesh.ply"
     result = geogs.load_result(folder)
-    made, again = extract_mesh(fusion_views(result.keyframes), FINE), result.mesh
+    made, again = extract_mesh(fusion_views(result.renders), FINE), result.mesh
     for name in ("vertices", "faces", "normals", "colours"):
         np.testing.assert_array_equal(getattr(made, name), getattr(again, name))
     z = (again.vertices[:, 2] - ORIGIN[2]) / UNIT

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import geogs
+from geogs.application.results.verdict import Verdict
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.keyframe_folder import image_path, read_image
@@ -43,12 +44,12 @@ def test_keyframes_come_with_what_the_run_had(result):
     own = poses_of_the_scene()
     for k, T_own in zip(result.keyframes, own, strict=True):
         truth = UNIT * depth_of_the_scene(T_own, DEPTH_CAMERA)
-        depth, known = k.depth.numpy(), k.depth.numpy() > 0
+        depth, known = k.depth, k.depth > 0
         assert known.mean() > (0.45 if k.keyframe_id == IDS[MASKED] else 0.95)
         assert np.quantile(np.abs(depth / truth - 1)[known], 0.8) < 5e-3
         assert k.image.shape == (60, 80, 3)
-        np.testing.assert_allclose(k.normal.norm(dim=-1)[k.depth > 0], 1.0, atol=1e-4)
-        assert ((k.normal * DEPTH_CAMERA.rays()).sum(-1)[k.depth > 0] < 0).all()
+        np.testing.assert_allclose(np.linalg.norm(k.normal, axis=-1)[known], 1.0, atol=1e-4)
+        assert ((k.normal * DEPTH_CAMERA.rays().numpy()).sum(-1)[known] < 0).all()
     masked = result.keyframes[MASKED]
     assert (masked.depth[:, 20:] == 0).all()
     assert (masked.weight[:, 20:] == 0).all()
@@ -108,7 +109,7 @@ def test_loaded_disks_are_rendered_as_they_are(result):
     disks = geogs.load_map(result.folder / "map.safetensors")
     T_cw = torch.from_numpy(result.views.T_cw[0])
     alone = geogs.render(disks, DEPTH_CAMERA, T_cw).median_depth
-    depth = result.keyframes[0].depth
+    depth = torch.from_numpy(result.keyframes[0].depth)
     shown = (depth > 0) & (alone > 0)
     assert shown.float().mean() > 0.9
     assert ((alone - depth).abs() / depth)[shown].median() < 1e-3
@@ -161,17 +162,53 @@ def test_a_map_that_tells_no_reach_of_its_planes_averages_over_twice_its_spread(
         change_views(path, max_spread=spread, plane_reach=None)
         loaded = geogs.load_result(tmp_path)
         assert loaded.renderer.rules.plane_reach == reach
-        assert torch.equal(loaded.keyframes[0].depth > 0, loaded.keyframes[0].weight > 0)
+        keyframe = loaded.keyframes[0]
+        assert ((keyframe.depth > 0) == (keyframe.weight > 0)).all()
     change_views(path, plane_reach=float("nan"))
     with pytest.raises(InputError, match="was it changed"):
         _ = geogs.load_result(tmp_path).views
+
+
+def test_all_that_a_keyframe_has_is_an_array_and_shown_by_its_size(result):
+    for keyframe in result.keyframes:
+        arrays = [v for v in (getattr(keyframe, f.name) for f in fields(keyframe)) if np.ndim(v)]
+        assert len(arrays) == (6 if keyframe.mask is not None else 5)
+        assert {type(array) for array in arrays} == {np.ndarray}
+        assert keyframe.T_cw.dtype == np.float64
+        assert "depth=30×40" in repr(keyframe)
+        assert len(repr(keyframe)) < 400
+    assert [k.mask is not None for k in result.keyframes].count(True) == 1
+
+
+@pytest.mark.parametrize(
+    ("said", "depth"),
+    [(0.02, 0.02), (None, float("inf")), (1, 1.0)],
+    ids=["known", "unknown", "whole"],
+)
+def test_the_verdict_of_a_run_is_read_back(tmp_path, said, depth):
+    own = Verdict(True, "Reliable.", 0.0, 0.1, 0.01, 0.2, depth, joined=0.9)
+    summary = {"verdict": {**asdict(own), "depth": said}}
+    (make_result(tmp_path) / "summary.json").write_text(json.dumps(summary))
+    assert geogs.load_result(tmp_path).verdict == own
+
+
+@pytest.mark.parametrize("verdict", ["good", 7, [], {"sentence": "Reliable."}, {"lost": "x"}])
+def test_a_verdict_that_is_none_is_refused(tmp_path, verdict):
+    (make_result(tmp_path) / "summary.json").write_text(json.dumps({"verdict": verdict}))
+    with pytest.raises(InputError, match=r"summary.json is damaged; its verdict is none"):
+        _ = geogs.load_result(tmp_path).verdict
+
+
+def test_a_result_of_given_poses_has_no_verdict(tmp_path):
+    (make_result(tmp_path) / "summary.json").write_text(json.dumps({"verdict": None}))
+    assert geogs.load_result(tmp_path).verdict is None
 
 
 def test_without_images_all_else_is_there(tmp_path):
     result = geogs.load_result(make_result(tmp_path, with_images=False))
     keyframe = result.keyframes[0]
     assert keyframe.image is None
-    assert float((keyframe.depth > 0).float().mean()) > 0.95
+    assert (keyframe.depth > 0).mean() > 0.95
 
 
 def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, result):

@@ -108,12 +108,12 @@ def _file(place: Path, name: str, *suffixes: str) -> Path:
 def _disk_colours(result: SavedResult) -> Float[np.ndarray, "n 3"]:
     """RGB in [0, 1] of the disks. Raises InputError if the result has no images."""
     result.require_images()
-    return splat_colours(result.disks, fusion_views(result.keyframes))
+    return splat_colours(result.disks, fusion_views(result.renders))
 
 
 def _write_cloud(path: Path, result: SavedResult) -> None:
     """Write the surface as points, by the ending of the path as LAS or PLY."""
-    positions, normals, colours = cloud(result.keyframes)
+    positions, normals, colours = cloud(result.renders)
     if path.suffix.lower() == ".las":
         write_las(path, positions, colours)
     else:
@@ -129,7 +129,7 @@ def _write_mesh(path: Path, result: SavedResult, settings: ExportSettings) -> No
         mesh.save(path)
     else:
         result.require_images()
-        views = fusion_views(result.keyframes)
+        views = fusion_views(result.renders)
         # Largest distance of a face from a depth map that shows it, in median mesh edges.
         tolerance = 2.0 * median_edge(mesh)
         m = texture_mesh(mesh, views, tolerance, settings.texture_size)

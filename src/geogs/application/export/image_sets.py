@@ -37,7 +37,7 @@ def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bo
         mask = result.image_mask(number)
         if mask is not None:
             write_mask(folder / "masks" / f"{image.name}.png", mask)
-    seen = seen_points(result.keyframes, result.camera, points)
+    seen = seen_points(result.renders, result.camera, points)
     write_colmap_model(folder / "sparse" / "0", result.camera, images, seen, as_text)
 
 
@@ -60,7 +60,7 @@ def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None
         depth, normal = _maps(number, result)
         write_depth_png(folder / "depth" / name, depth, unit)
         write_normal_png(folder / "normals" / name, normal)
-    seen = seen_points(result.keyframes, result.camera, points)
+    seen = seen_points(result.renders, result.camera, points)
     write_points(folder / "points.ply", seen.positions, seen.colours, seen.normals)
     path = folder / "transforms.json"
     write_transforms(path, result.camera, images, masked, unit)
@@ -129,7 +129,7 @@ def _maps(number: int, result: SavedResult) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _farthest(result: SavedResult) -> float:
-    return max((float(keyframe.depth.max()) for keyframe in result.keyframes), default=0.0)
+    return max((float(keyframe.depth.max()) for keyframe in result.renders), default=0.0)
 
 
 def _nerfstudio_unit(result: SavedResult) -> float:

@@ -81,11 +81,11 @@ def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Pat
         raise InputError(f"{path} should end in .ply; geogs export writes other formats.")
     if path != folder / "mesh.ply":
         result = load_result(folder, require_device(settings.device))
-        fused(result.keyframes, settings.mesh, follow).save(path)
+        fused(result.renders, settings.mesh, follow).save(path)
         return path
     with claimed(folder), replaced(folder, "part") as new:
         result = load_result(folder, require_device(settings.device))
-        mesh = fused(result.keyframes, settings.mesh, follow)
+        mesh = fused(result.renders, settings.mesh, follow)
         mesh.save(new / "mesh.ply")
         write_page_anew(new, result, mesh)
     return path

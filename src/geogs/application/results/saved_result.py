@@ -1,7 +1,8 @@
 """A result read from its folder by ``load_result``."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from geogs.application.results.output_folder import claimed, read_summary
+from geogs.application.results.verdict import Verdict
 from geogs.camera.shutter.rows import CELL
 from geogs.checked_arguments import checks_arguments
-from geogs.documents import expanded
+from geogs.documents import UNUSABLE, expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
@@ -37,12 +39,50 @@ from geogs.mapping.rendered import MapRenderer, RenderedView, SurfaceRules
 from geogs.mesh.mesh_file import read_mesh
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.on_demand import OnDemand
+from geogs.short_repr import ShortRepr
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 
 _MOST_UNSEEN = 1 << 24
 """Most pixels of a depth map in a result that has no images."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class SavedKeyframe(ShortRepr):
+    """A keyframe of a result, with the map rendered from it."""
+
+    keyframe_id: int
+    timestamp: float
+    """Seconds."""
+    T_cw: Float64[np.ndarray, "4 4"]
+    """World to camera."""
+    camera: Camera
+    """Camera of the maps."""
+    depth: Float32[np.ndarray, "h w"]
+    """z in map units; 0 where the map is too thin."""
+    normal: Float32[np.ndarray, "h w 3"]
+    """Camera frame, unit and facing the camera; zero where there is no depth."""
+    weight: Float32[np.ndarray, "h w"]
+    """Confidence of the depth in [0, 1]."""
+    image: UInt8[np.ndarray, "h2 w2 3"] | None
+    """RGB at working resolution; None in a result that was written without images."""
+    mask: Bool[np.ndarray, "h w"] | None
+    """Pixels that belong to the scene; None where all do."""
+
+    @staticmethod
+    def of(seen: RenderedKeyframe) -> "SavedKeyframe":
+        """Copy a rendered keyframe from its device."""
+        arrays = (seen.depth, seen.normal, seen.weight)
+        return SavedKeyframe(
+            seen.keyframe_id,
+            seen.timestamp,
+            seen.T_cw.numpy(),
+            seen.camera,
+            *(tensor.cpu().numpy() for tensor in arrays),
+            seen.image,
+            None if seen.mask is None else seen.mask.cpu().numpy(),
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -108,8 +148,26 @@ class SavedResult:
         return read_mesh(path) if path.is_file() else None
 
     @cached_property
-    def keyframes(self) -> Sequence[RenderedKeyframe]:
-        """Image, pose, depth, normal and weight of the keyframes, rendered on demand."""
+    def verdict(self) -> Verdict | None:
+        """Reliability of trajectory and shape; none where the poses were given.
+
+        Raises InputError if ``summary.json`` is missing or damaged.
+        """
+        said = self.summary.get("verdict")
+        try:
+            return None if said is None else _verdict(said)
+        except UNUSABLE as error:
+            path = self.folder / "summary.json"
+            raise InputError(f"{path} is damaged; its verdict is none.") from error
+
+    @cached_property
+    def keyframes(self) -> Sequence[SavedKeyframe]:
+        """Image, pose, depth, normal and weight of the keyframes, rendered on demand, as arrays."""
+        return OnDemand(self.renders, SavedKeyframe.of)
+
+    @cached_property
+    def renders(self) -> Sequence[RenderedKeyframe]:
+        """The same, with tensors on the device of the disks."""
         return OnDemand(range(len(self.views.keyframe_id)), self._keyframe)
 
     @cached_property
@@ -188,6 +246,13 @@ class SavedResult:
         maps = self.renderer.surface(T_cw, mask=mask)
         seconds = float(views.timestamp[number])
         return RenderedKeyframe(id, self.depth_camera, T_cw, *maps, image, seconds, mask)
+
+
+def _verdict(said: dict[str, Any]) -> Verdict:
+    """The verdict of a summary, which has none in place of infinity."""
+    known = {f.name: f.type for f in fields(Verdict) if f.name in said}
+    values = {name: math.inf if said[name] is None else said[name] for name in known}
+    return Verdict(**{name: kind(values[name]) for name, kind in known.items()})  # type: ignore[operator]
 
 
 @checks_arguments

@@ -96,7 +96,7 @@ class _Inspector:
         image = result.image(number) if layer == "image" else None
         if image is not None:
             return image
-        return layer_picture(result.keyframes[number], layer)
+        return layer_picture(result.renders[number], layer)
 
     def _words(self, number: int) -> tuple[str, str]:
         result = self._result
