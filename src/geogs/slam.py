@@ -61,6 +61,7 @@ class Slam(SlamOutput):
 
         Args:
             camera: pinhole of all images, which are undistorted.
+            config: all settings; the defaults if none.
             device: auto (a GPU where there is one), cpu, cuda or cuda:1.
             prior: monocular prior, applied to every keyframe.
             live: return from :meth:`process` when the pose is known, and do the rest in threads;
