@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import geogs
-from geogs.checked_arguments import checks_arguments
 from geogs.config import preset, reconstruct_preset
+from geogs.config.arguments import checks_arguments
 from geogs.errors import InputError
 from geogs.slam_input import input_frame, require_mask
 from geogs.types import MeasuredPose
@@ -33,12 +33,12 @@ def altered(record, **fields):
 
 CALLS = {
     "a device that is a number": (lambda: geogs.Slam(CAMERA, device=3), "device"),
-    "a preset for a configuration": (lambda: geogs.Slam(CAMERA, "fast"), "Config or None"),
+    "a preset for a configuration": (lambda: geogs.Slam(CAMERA, "fast"), "Config or none"),
     "settings of another command": (lambda: geogs.Slam(CAMERA, geogs.ReconstructConfig()), "Conf"),
     "a matrix for a camera": (lambda: geogs.Slam(np.eye(3)), "give Camera"),
     "a mask of numbers": (lambda: require_mask(np.ones((72, 96)), CAMERA), "bool, 72 x 96"),
     "a mask on its side": (lambda: geogs.Slam(CAMERA, mask=np.ones((96, 72), bool)), "72 x 96"),
-    "a dictionary for a world": (lambda: geogs.Slam(CAMERA, world={}), "World or None"),
+    "a dictionary for a world": (lambda: geogs.Slam(CAMERA, world={}), "World or none"),
     "no source": (lambda: geogs.run(None), "source is NoneType"),
     "a source among others that is none": (lambda: geogs.run(["a.mp4", 3]), "source is list"),
     "an unknown preset": (lambda: geogs.run("a.mp4", preset="slow"), "'slow'; give default or"),
@@ -50,14 +50,14 @@ CALLS = {
     "a function for a progress": (lambda: geogs.run("a.mp4", progress=print), "RunProgress"),
     "a preset that there is not": (lambda: preset("slow"), "fast or accurate or paper"),
     "a preset in capitals": (lambda: reconstruct_preset("Fast"), "fast or accurate or paper"),
-    "a system that is none": (lambda: geogs.track("a.mp4", slam="x"), "Slam or None"),
-    "a map from nowhere": (lambda: geogs.load_map(None), "str or Path"),
-    "a result from nowhere": (lambda: geogs.load_result(7), "str or Path"),
-    "a budget in words": (lambda: geogs.reconstruct("a", budget="2m"), "a number or None"),
+    "a system that is none": (lambda: geogs.track("a.mp4", slam="x"), "Slam or none"),
+    "a map from nowhere": (lambda: geogs.load_map(None), "a text or a path"),
+    "a result from nowhere": (lambda: geogs.load_result(7), "a text or a path"),
+    "a budget in words": (lambda: geogs.reconstruct("a", budget="2m"), "a number or none"),
     "poses in another way": (lambda: geogs.reconstruct("a", poses="found"), "given or auto"),
     "something else to save": (lambda: geogs.save_slam(IMAGE, "map"), "slam is ndarray"),
     "something else with a mesh": (lambda: geogs.slam_mesh(None), "slam is NoneType"),
-    "input settings of another kind": (lambda: geogs.open_source("a", {}), "InputConfig or None"),
+    "input settings of another kind": (lambda: geogs.open_source("a", {}), "InputConfig or none"),
     "too wide a view": (lambda: CAMERA.with_field_of_view(180.0), "180 degrees"),
 }  # fmt: skip
 

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from geogs.checked_arguments import checks_arguments
 from geogs.config import Config
+from geogs.config.arguments import checks_arguments
 from geogs.entrance import Entrance, changes_system
 from geogs.errors import InputError
 from geogs.executors.in_order import Deferred, InOrder

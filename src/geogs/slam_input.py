@@ -6,7 +6,7 @@ from numbers import Real
 import numpy as np
 import torch
 
-from geogs.checked_arguments import check_fields
+from geogs.config.arguments import check_fields
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import as_pose

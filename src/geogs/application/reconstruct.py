@@ -26,8 +26,8 @@ from geogs.application.results.result import Result
 from geogs.application.results.surfaces import Snapshots
 from geogs.application.run_settings import ReconstructSettings
 from geogs.application.structure_from_motion.photos import open_photographs
-from geogs.checked_arguments import checks_arguments
 from geogs.config import ReconstructConfig
+from geogs.config.arguments import checks_arguments
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded
 from geogs.errors import InputError

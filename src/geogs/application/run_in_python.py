@@ -9,9 +9,9 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.result import Result
 from geogs.application.run import run as run_to_folder
 from geogs.application.run_settings import RunSettings
-from geogs.checked_arguments import checks_arguments
 from geogs.config import Config, Preset
 from geogs.config import preset as preset_config
+from geogs.config.arguments import checks_arguments
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu
 

@@ -14,8 +14,8 @@ from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.write import write_config
-from geogs.checked_arguments import checks_arguments
 from geogs.config import Config
+from geogs.config.arguments import checks_arguments
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.frame_source import Source

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
 
-from geogs.checked_arguments import checks_arguments
+from geogs.config.arguments import checks_arguments
 from geogs.config.input_config import InputConfig
 from geogs.config.loss_config import LossConfig
 from geogs.config.mapping_config import DepthConfig, MappingConfig, PhotoConfig

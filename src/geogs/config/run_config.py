@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, get_args
 
-from geogs.checked_arguments import checks_arguments
+from geogs.config.arguments import checks_arguments
 from geogs.config.input_config import InputConfig
 from geogs.config.mapping_config import MappingConfig
 from geogs.config.mesh_config import MeshConfig

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from geogs.application.results.output_folder import claimed, read_summary
 from geogs.application.results.verdict import Verdict
 from geogs.camera.shutter.rows import CELL
-from geogs.checked_arguments import checks_arguments
+from geogs.config.arguments import checks_arguments
 from geogs.documents import UNUSABLE, expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

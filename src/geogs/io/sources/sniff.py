@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.checked_arguments import checks_arguments
 from geogs.config import InputConfig
+from geogs.config.arguments import checks_arguments
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress, live_address

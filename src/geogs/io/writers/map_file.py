@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from geogs.checked_arguments import checks_arguments
+from geogs.config.arguments import checks_arguments
 from geogs.documents import UNUSABLE, require_file
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

@@ -42,16 +42,11 @@ LIST = ".geogs.json"
 _NEW = re.compile(r"\.geogs\.(\d{1,20})\.(new|ready)")
 _MARKS = ("summary.json", "map.safetensors")
 """Files of every result, which identify one without a list."""
-_FILES = (
-    *_MARKS,
-    "config.yaml",
-    "intrinsics.json",
-    "keyframes.tum",
-    "mesh.ply",
-    "splats.ply",
-    "trajectory.tum",
-    "trajectory_uncertainty.csv",
+_OTHERS = (
+    "config.yaml intrinsics.json keyframes.tum mesh.ply splats.ply trajectory.tum "
+    "trajectory_uncertainty.csv"
 )
+_FILES = (*_MARKS, *_OTHERS.split())
 """Files that a result may need, checked before the work begins."""
 _FOLDERS = ("adjusted", "depth_fusion", "keyframes", "online", "report", "snapshots")
 """Folders that a result may need, checked before the work begins."""
