@@ -13,7 +13,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
 FRAMES = 26
 
 
-def quick(name: str) -> Config:
+def quick(name: str, on_gpu: bool = False) -> Config:
     """In place of a preset: few frames, little training."""
     c = Config()
     depth = replace(c.mapping.depth, planes=48)
@@ -28,7 +28,8 @@ def quick(name: str) -> Config:
 @pytest.mark.long
 @pytest.mark.system
 def test_the_examples_run_as_they_stand(small_room, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("geogs.config.preset", quick)
+    for place in ("geogs.config.preset", "geogs.application.run_in_python.preset_config"):
+        monkeypatch.setattr(place, quick)
     room = tmp_path / "room"
     (room / "results").mkdir(parents=True)
     (room / "cam_params.json").symlink_to(small_room / "cam_params.json")

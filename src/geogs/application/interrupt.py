@@ -112,9 +112,10 @@ class Interruption(Stop):
             for number, before in self._before.items():
                 signal.signal(number, before)
         error = exception[1]
-        is_stopped = isinstance(error, KeyboardInterrupt) and not isinstance(error, Interrupted)
         # Of a source that was cut off there may be too little to use; that is no fault of it.
-        if self.requested and (is_stopped or isinstance(error, InputError | TrackingLost)):
+        if not self.requested or isinstance(error, Interrupted):
+            return
+        if isinstance(error, KeyboardInterrupt | InputError | TrackingLost):
             raise Interrupted(self.code, *error.args) from error
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

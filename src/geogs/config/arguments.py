@@ -33,7 +33,7 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 def check_fields(record: object) -> None:
     """Raise InputError if a field of a dataclass is not what its annotation says."""
-    kind = type(record)
+    kind: Any = type(record)
     for field, hint in _hints(kind).items():
         _check(f"{kind.__name__}: {field}", getattr(record, field), hint)
 

@@ -73,13 +73,14 @@ class SavedKeyframe(ShortRepr):
     @staticmethod
     def of(seen: RenderedKeyframe) -> "SavedKeyframe":
         """Copy a rendered keyframe from its device."""
-        arrays = (seen.depth, seen.normal, seen.weight)
         return SavedKeyframe(
             seen.keyframe_id,
             seen.timestamp,
             seen.T_cw.numpy(),
             seen.camera,
-            *(tensor.cpu().numpy() for tensor in arrays),
+            seen.depth.cpu().numpy(),
+            seen.normal.cpu().numpy(),
+            seen.weight.cpu().numpy(),
             seen.image,
             None if seen.mask is None else seen.mask.cpu().numpy(),
         )
