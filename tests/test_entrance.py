@@ -85,6 +85,8 @@ def test_a_forked_child_is_refused_in_a_sentence_and_can_make_its_own():
         try:
             with pytest.raises(InputError, match="before the process was forked"):
                 slam.process(image(3))
+            with pytest.raises(InputError, match="before the process was forked"):
+                slam.trajectory()
             own = system()
             states = [own.process(image(number)).state.value for number in range(4)]
             os.write(writer, f"{own.frames} {states[0]}".encode())

@@ -23,6 +23,14 @@ class Entrance:
         self._lock = threading.RLock()
         self._is_unfinished = False
 
+    def require_process(self) -> None:
+        """Raise InputError in another process than that in which the system was made."""
+        if os.getpid() != self._process:
+            raise InputError(
+                "This system was made before the process was forked, and its threads stayed "
+                "behind; make it in the new process, or start that by multiprocessing's spawn."
+            )
+
     @contextmanager
     def entered(self) -> Iterator[None]:
         """Context of a change.
@@ -30,11 +38,7 @@ class Entrance:
         Raises:
             InputError: another thread is changing the system, or another process made it.
         """
-        if os.getpid() != self._process:
-            raise InputError(
-                "This system was made before the process was forked, and its threads stayed "
-                "behind; make it in the new process, or start that by multiprocessing's spawn."
-            )
+        self.require_process()
         if not self._lock.acquire(blocking=False):
             raise InputError("Another thread is at work in this system; wait until it is done.")
         try:

@@ -9,6 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.config import Config
+from geogs.entrance import Entrance
 from geogs.errors import InputError
 from geogs.executors.in_order import InOrder
 from geogs.geometry.camera import Camera
@@ -45,6 +46,7 @@ class SlamOutput:
     loops: LoopCloser
     executor: InOrder
     stopwatch: Stopwatch
+    entrance: Entrance
 
     def __repr__(self) -> str:
         keyframes = len(self.segments.keyframe_ids)
@@ -89,7 +91,11 @@ class SlamOutput:
 
     @on_one_torch_thread
     def settle(self) -> None:
-        """Wait until the world includes all results of the last frame."""
+        """Wait until the world includes all results of the last frame.
+
+        Raises InputError in a forked process, which has none of the threads.
+        """
+        self.entrance.require_process()
         self.executor.settle()
 
     def settled(self) -> World:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from geogs.config.arguments import checks_arguments
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.splat.protocols import Forward
@@ -51,6 +52,7 @@ class RenderOutput:
         return torch.where(self.alpha.detach() > min_alpha, self.depth, 0.0)
 
 
+@checks_arguments
 def render(
     disks: GaussianMap | DiskParameters | MapSnapshot,
     camera: Camera,
@@ -189,6 +191,7 @@ class PullBack:
             return self._backward((depth, normal, alpha, distortion))
 
 
+@checks_arguments
 def render_vjp(
     disks: GaussianMap | DiskParameters | MapSnapshot,
     camera: Camera,

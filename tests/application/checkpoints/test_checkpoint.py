@@ -241,6 +241,27 @@ def test_where_nothing_can_be_written_that_is_said_once(tmp_path, monkeypatch):
     assert "it is no folder" in said[0]
 
 
+@pytest.mark.parametrize("is_there", [True, False], ids=["a link", "nothing"])
+def test_in_a_folder_that_was_swapped_no_checkpoint_is_begun(tmp_path, monkeypatch, is_there):
+    said: list[str] = []
+    monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
+    out = tmp_path / "out"
+    elsewhere = tmp_path / "elsewhere"
+    out.mkdir()
+    elsewhere.mkdir()
+    checkpoint = Checkpoint(out, 0.001, lambda: state(1), RunProgress(), Stopwatch())
+    assert checkpoint.write()
+    out.rename(tmp_path / "moved")
+    if is_there:
+        out.symlink_to(elsewhere)
+    assert not checkpoint.write()
+    assert not checkpoint.write()
+    assert said == [f"No more checkpoints: {out} is another folder than at the beginning."]
+    assert not list(elsewhere.iterdir())
+    assert out.is_symlink() == is_there
+    assert (tmp_path / "moved" / "checkpoint" / "manifest.json").is_file()
+
+
 # --- what others put there ------------------------------------------------------------------------
 
 

@@ -22,6 +22,7 @@ from geogs.application.machine.device import is_gpu_failure
 from geogs.application.progress.run_progress import RunProgress
 from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError, OutputError
+from geogs.io.writers.directory import identity
 from geogs.stopwatch import Stopwatch
 from geogs.version import __version__
 from geogs.world.archive import Archive, SettledArchive
@@ -49,6 +50,8 @@ class Checkpoint:
 
         ``state`` gives the record to write; none while there is nothing to resume from.
         """
+        self._output = output
+        self._place = identity(output)
         self._folder = checkpoint_folder(output)
         self._every = every
         self._state = state
@@ -75,6 +78,8 @@ class Checkpoint:
             return False
         start = time.perf_counter()
         try:
+            if identity(self._output) != self._place:
+                raise OutputError(f"{self._output} is another folder than at the beginning.")
             write_checkpoint(self._folder, state)
         except OutputError as error:
             self._progress.write(f"No more checkpoints: {error}")

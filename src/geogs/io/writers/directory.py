@@ -46,9 +46,7 @@ class Directory:
 
     def is_at_its_path(self) -> bool:
         """Whether its path still leads to it."""
-        with suppress(OSError):
-            return os.path.samestat(os.fstat(self._handle), os.stat(self.path))
-        return False
+        return identity(self._handle) == identity(self.path)
 
     @contextmanager
     def inner(self, name: str) -> Iterator["Directory"]:
@@ -175,3 +173,11 @@ class Directory:
             if not stat.S_ISREG(os.fstat(number).st_mode):
                 raise FileNotFoundError(f"{name} is no plain file")
             yield file
+
+
+def identity(place: Path | int) -> tuple[int, int] | None:
+    """Numbers of the disk and of the folder that a path or a handle leads to; None for nothing."""
+    with suppress(OSError):
+        status = os.stat(place)
+        return status.st_dev, status.st_ino
+    return None
