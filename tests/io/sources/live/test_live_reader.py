@@ -76,6 +76,21 @@ def test_a_pipe_is_read_on_where_it_is():
     assert first.image.shape == (48, 64, 3)
 
 
+@pytest.mark.parametrize(
+    ("start", "size", "said"),
+    [
+        (0, 0, "pipe ended before its first image."),
+        (0, 48 * 64, "pipe ended before its first image."),
+        (5, 3 * 48 * 64, "pipe ends before frame 5; give a smaller start."),
+    ],
+)
+def test_a_pipe_that_ends_too_early_is_told_apart_from_a_start_that_is_too_late(start, size, said):
+    reader = LiveReader(Pipe(io.BytesIO(bytes(size)), "64x48:rgb24"))
+    with pytest.raises(InputError) as refused:
+        next(iter(Source([WorkingImages(reader, InputConfig(start=start))])))
+    assert str(refused.value) == said
+
+
 def test_what_cannot_be_opened_ends_in_a_sentence(monkeypatch, tmp_path, capfd):
     with pytest.raises(InputError, match=r"camera-99 cannot be opened; is it plugged in"):
         open_source("camera:99")
