@@ -90,7 +90,9 @@ def _attempt(job: FleetJob) -> tuple[State, str, dict[str, Any]]:
     (place / FILE).delete()  # row of a previous result, which is about to be replaced
     folder = WorkFolder(place)
     source = StoragePath(job.source.address).path or fetched(job.source, folder.scratch)
-    settings = replace(job.settings, source=(source,), output=folder.path)
+    # A local folder is replaced only where an earlier attempt of a fleet has worked in it.
+    is_own = place.path is None or (folder.path / LOG).exists()
+    settings = replace(job.settings, source=(source,), output=folder.path, overwrite=is_own)
     environment = os.environ | {"OMP_NUM_THREADS": str(job.threads)}
     log = folder.path / LOG
     ending = supervise(

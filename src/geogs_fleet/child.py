@@ -12,6 +12,7 @@ import pickle
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -61,7 +62,7 @@ def compute(settings: RunSettings) -> None:
                 resume(output, settings, progress)
             except InputError as error:  # for example, the source has changed
                 progress.write(f"Starting anew: {error}")
-                run(settings, progress)
+                run(replace(settings, overwrite=True), progress)
         else:
             run(settings, progress)
     write_thumbnail(output)

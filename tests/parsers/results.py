@@ -11,7 +11,7 @@ import mutations
 from geogs.application.evaluate import evaluate
 from geogs.application.export.image_sets import write_colmap_set, write_nerfstudio_set
 from geogs.application.result_settings import EvalSettings
-from geogs.application.results.output_folder import free_folder
+from geogs.application.results.output_folder import chosen_folder
 from geogs.application.results.result_page import shown_model, shown_views, write_page_anew
 from geogs.application.results.revise import mesh_settings
 from geogs.application.results.saved_result import load_result
@@ -60,7 +60,7 @@ def results() -> dict[str, Parser]:
         "summary-evaluated": ("summary.json", mutations.json_text, judged),
         "camera-evaluated": ("intrinsics.json", mutations.json_text, judged),
         "summary-of-another": (
-            "summary.json", mutations.json_text, lambda f: free_folder(f, "0123456789abcdef")
+            "summary.json", mutations.json_text, lambda f: chosen_folder(None, str(f), False)
         ),
     }  # fmt: skip
     found = {k: Parser(complete, (file,), damage, use) for k, (file, damage, use) in files.items()}

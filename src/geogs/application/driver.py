@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation
 from geogs.application.machine.device import REMEDY, gpu_errors_in_a_sentence
 from geogs.application.progress.run_progress import RunProgress
+from geogs.application.results.output_folder import claimed, free_folder, is_complete
 from geogs.application.results.result import Result
 from geogs.application.results.surfaces import write_depth_mesh
 from geogs.application.results.write import write_files
@@ -73,6 +74,14 @@ class Work(ABC):
 
     def write_more(self, driver: "Driver", new: Path) -> None:  # noqa: B027  # most have none
         """Write additional files into the new folder of the result."""
+
+
+class _FormerStays(Exception):
+    """An interrupted result was written into another folder, as a complete one is there."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.folder = folder
 
 
 @dataclass(frozen=True)
@@ -145,6 +154,11 @@ class Driver:
                     result = Result(scene, work.source, not finished, progress, output, can_resume)
                     write_more = partial(self._write_more, work, new)
                     write_files(new, result, write_more, settings.keyframe_images)
+                    if not finished and is_complete(output):
+                        raise _FormerStays(self._written_beside(new))
+            except _FormerStays as kept:
+                result = replace(result, folder=kept.folder, can_resume=False)
+                progress.write(way_on().strip())
             except OutputError as error:
                 raise OutputError(f"{error}{way_on()}") from error
             if self.observer is not None:
@@ -152,11 +166,21 @@ class Driver:
         if outcome is Outcome.MEMORY_FULL:
             raise DeviceError(
                 f"The memory of the GPU was full after {scene.frames} frames, whose results are in "
-                f"{output}/; {REMEDY}.{way_on()}"
+                f"{result.folder}/; {REMEDY}.{way_on()}"
             )
         if finished and work.way_on:
             checkpoint.remove()
         return result
+
+    def _written_beside(self, new: Path) -> Path:
+        """Put the files of an interrupted result into a folder of their own. Returns the folder."""
+        with claimed(free_folder(self.output)) as other, replaced(other, "result") as files:
+            for path in new.iterdir():
+                path.rename(files / path.name)
+        self.progress.write(
+            f"The complete result in {self.output} stays; what there is now goes to {other}."
+        )
+        return other
 
     def _write_more(self, work: Work, new: Path) -> None:
         work.write_more(self, new)

@@ -21,7 +21,7 @@ from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_
 from geogs.application.output_cost import OutputForecast
 from geogs.application.posed_views import PosedViews
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.output_folder import claimed, free_folder
+from geogs.application.results.output_folder import chosen_folder, claimed
 from geogs.application.results.result import Result
 from geogs.application.results.surfaces import Snapshots
 from geogs.application.run_settings import ReconstructSettings
@@ -34,6 +34,7 @@ from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.pose_check import PoseCheck, check_poses, with_focal_length
 from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.reader import without_ending
 from geogs.io.sources.sniff import open_posed_source
 from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.stopwatch import StageProgress
@@ -131,15 +132,13 @@ def reconstruct_to_folder(
         progress.write(f"note: {sentence}")
     finds_poses = settings.poses == "auto"
     if finds_poses:
-        wanted = Path("out") / expanded(settings.source).resolve().name
+        name = expanded(settings.source).resolve().name
     else:
         source = open_posed_source(settings.source, config.input, settings.hold_out)
-        wanted = Path("out") / source.name
-        if not settings.resume:
-            wanted = free_folder(wanted, source.fingerprint())
-
+        name = without_ending(source.name, [settings.source])
+    may_replace = settings.overwrite or settings.resume
     with (
-        claimed(settings.output or wanted) as output,
+        claimed(chosen_folder(settings.output, name, may_replace, progress)) as output,
         compiling(device, knows_poses=True) as kernels,
     ):
         if finds_poses:

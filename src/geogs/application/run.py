@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from geogs.application.calibrate import self_calibrated, without_overlay
-from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver, Work
 from geogs.application.interrupt import Stop
@@ -16,7 +15,7 @@ from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
-from geogs.application.results.output_folder import claimed, free_folder
+from geogs.application.results.output_folder import chosen_folder, claimed
 from geogs.application.results.result import Result
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.run_settings import RunSettings
@@ -65,9 +64,10 @@ def run(
     base = None if settings.map is None else load_result(settings.map, device)
     opened = opened_for(settings, base)
     _check_input(settings, opened, progress)
-    wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
+    wanted = settings.output or Path("out") / opened.stem
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
+    wanted = chosen_folder(settings.output, opened.stem, settings.overwrite, progress)
     compiled = compiling(device) if kernels is None else nullcontext(kernels)
     with claimed(wanted) as output, compiled as kernels:
         compile_gpu_kernels(device)
@@ -122,12 +122,7 @@ def _offline(config: Config, driver: Driver, opened: Source) -> Work:
 
 
 def _metadata(settings: RunSettings, driver: Driver, opened: Source, source: Source) -> RunMetadata:
-    """Metadata of a run for its checkpoints; writes a note if the folder already has one."""
-    if has_checkpoint(driver.output):
-        driver.progress.write(
-            f"Starting anew. geogs run --resume {driver.output} continues the unfinished run "
-            "there, until this one writes a checkpoint."
-        )
+    """Metadata of a run for its checkpoints."""
     found = None if source.calibration is opened.calibration else source.calibration
     return RunMetadata(
         settings.absolute(), driver.device.type, source.fingerprint(), found, shutter=source.shutter

@@ -24,6 +24,7 @@ def run(
     device: str | torch.device = "auto",
     *,
     preset: Preset = "default",
+    overwrite: bool = False,
     progress: RunProgress | None = None,
 ) -> Result:
     """Do all of ``geogs run``, with its files, silently. Returns the result.
@@ -31,15 +32,17 @@ def run(
     Args:
         source: a video, a folder, a data set, a bag, or several of one scene.
         config: all settings; without them those of the ``preset``, for the device.
-        output: folder of the result; out/NAME if none is given, see ``Result.folder``.
+        output: folder of the result; out/NAME if none is given, or out/NAME-2 where that is taken,
+            see ``Result.folder``.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
         preset: fast, default, accurate or paper; for settings beside it give a ``config``.
+        overwrite: replace an earlier result in the folder, once the new one is complete.
         progress: follows the work.
 
     Raises:
         InputError: the source or a setting cannot be used.
         TrackingLost: no frame could be tracked.
-        OutputError: a file cannot be written.
+        OutputError: a file cannot be written, or the folder holds a result already.
         DeviceError: the device cannot be used, or its memory was full.
     """
     several = (source,) if isinstance(source, str | Path) else source
@@ -48,5 +51,6 @@ def run(
         raise InputError("A config has all settings; leave out either config or preset.")
     on_gpu = preset == "default" and is_gpu(str(device))
     config = config or preset_config(preset, on_gpu)
-    settings = RunSettings(tuple(map(Path, several)), config, folder, str(device))
+    paths = tuple(map(Path, several))
+    settings = RunSettings(paths, config, folder, str(device), overwrite=overwrite)
     return run_to_folder(settings, progress)

@@ -32,7 +32,7 @@ class RunSettings(Settings):
     config: Annotated[Config, Unnamed] = field(default_factory=Config)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
-    """Folder for the results; out/NAME if none is given."""
+    """Folder for the results; out/NAME if none is given, or out/NAME-2 where that is taken."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     checkpoint_every: Weight = 60.0
@@ -59,6 +59,8 @@ class RunSettings(Settings):
     """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
     keyframe_images: bool = True
     """Keep the images of the keyframes in keyframes/, which geogs mesh and geogs export use."""
+    overwrite: bool = False
+    """Replace the result that is in the folder, once the new one is complete."""
 
     def absolute(self) -> "RunSettings":
         """The same with absolute paths, and without an output folder."""
@@ -83,7 +85,7 @@ class ReconstructSettings(Settings):
     config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
-    """Folder for the results; out/NAME if none is given."""
+    """Folder for the results; out/NAME if none is given, or out/NAME-2 where that is taken."""
     budget: Annotated[float | None, Range(above=0), Time] = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
     poses: Literal["given", "auto"] = "given"
@@ -106,6 +108,8 @@ class ReconstructSettings(Settings):
     none."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
+    overwrite: bool = False
+    """Replace the result that is in the folder, once the new one is complete."""
 
 
 @dataclass(frozen=True)

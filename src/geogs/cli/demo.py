@@ -48,7 +48,7 @@ def demo(options: DemoOptions) -> int:
     with compiling(require_device("auto")) as kernels:
         steps: dict[str, tuple[Callable[[Sequence[str]], int], list[str]]] = {
             "synth": (find_command("synth").run, [room, *sizes]),
-            "run": (partial(run.main, kernels=kernels), [room, "-o", result]),
+            "run": (partial(run.main, kernels=kernels), [room, "-o", result, "--overwrite"]),
             "eval": (find_command("eval").run, [result, "--gt", room]),
         }
         for name, (command, arguments) in steps.items():

@@ -157,6 +157,7 @@ class Board:
         command += place.options.split()
         command += ["-o", str(result), "--device", self.device, "--seed", str(seed)]
         command += ["--start", str(start)] if start else []
+        command += ["--overwrite", "--no-strict"]
         with tempfile.TemporaryDirectory() as scratch:
             # Compiled code would keep the usual value of a constant.
             is_compiled_anew = row.has_empty_cache or self.changed is not None

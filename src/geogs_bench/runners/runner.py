@@ -81,7 +81,7 @@ class Runner:
 
 def settings_of(task: Task) -> RunSettings | ReconstructSettings:
     """Settings from a task's options, by the command's own parser."""
-    argv = [str(task.source), "-o", str(task.output)]
+    argv = [str(task.source), "-o", str(task.output), "--overwrite"]
     argv += [argument for option in task.options for argument in option.arguments()]
     if task.command in ("run", "track", "update"):
         return record(RunSettings, run_command.parse(argv))

@@ -1,23 +1,78 @@
-"""No result is taken for another's; no empty folder is left."""
+"""No result is replaced unasked; no empty folder is left."""
 
 import json
+from pathlib import Path
 
 import pytest
 
-from geogs.application.results.output_folder import claimed, free_folder
+from geogs.application.progress.run_progress import RunProgress
+from geogs.application.results.output_folder import (
+    chosen_folder,
+    claimed,
+    content,
+    free_folder,
+    is_complete,
+)
+from geogs.errors import OutputError
 
 
-def test_sources_of_one_name_get_folders_of_their_own(tmp_path):
-    wanted = tmp_path / "images"
-    assert free_folder(wanted, "a") == wanted
-    wanted.mkdir()
-    assert free_folder(wanted, "a") == wanted
-    (wanted / "summary.json").write_text(json.dumps({"fingerprint": "a"}))
-    assert free_folder(wanted, "a") == wanted
-    assert free_folder(wanted, "b") == tmp_path / "images-2"
-    (tmp_path / "images-2").mkdir()
-    (tmp_path / "images-2" / "summary.json").write_text('{"source": "images"}')
-    assert free_folder(wanted, "b") == tmp_path / "images-3"
+class Heard(RunProgress):
+    """What was said."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def write(self, text: str) -> None:
+        self.said.append(text)
+
+
+def put(folder: Path, summary: str = '{"source": "video.mp4"}') -> Path:
+    folder.mkdir(parents=True)
+    (folder / "summary.json").write_text(summary)
+    return folder
+
+
+def test_a_result_without_a_named_folder_gets_one_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    heard = Heard()
+    assert chosen_folder(None, "video", False, heard) == Path("out/video")
+    assert not heard.said
+    put(Path("out/video"))
+    put(Path("out/video-2"), "[]")
+    assert chosen_folder(None, "video", False, heard) == Path("out/video-3")
+    assert heard.said == [
+        "out/video holds the result of video.mp4, which stays; this result goes to out/video-3."
+    ]
+    assert chosen_folder(None, "video", True, heard) == Path("out/video")
+
+
+@pytest.mark.parametrize("summary", ['{"source": "b"}', "[]", "{", '{"source": "\\u001b[31m"}'])
+def test_a_named_folder_with_a_result_is_refused(tmp_path, summary):
+    folder = put(tmp_path / "kept", summary)
+    with pytest.raises(OutputError, match="--overwrite to replace it") as caught:
+        chosen_folder(folder, "other", False)
+    assert str(caught.value).isprintable()
+    assert chosen_folder(folder, "other", True) == folder
+    assert chosen_folder(tmp_path / "new", "other", False) == tmp_path / "new"
+    (tmp_path / "of-others").mkdir()
+    (tmp_path / "of-others" / "notes.txt").write_text("mine")
+    assert chosen_folder(tmp_path / "of-others", "x", False) == tmp_path / "of-others"
+
+
+def test_a_write_that_was_interrupted_counts_as_a_result(tmp_path):
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    part = folder / "part"
+    part.mkdir()
+    part.rename(folder / f".geogs.{part.stat().st_ino}.ready")
+    assert content(folder) == "a result"
+    assert free_folder(folder) == tmp_path / "killed-2"
+
+
+def test_only_a_result_that_came_to_its_end_is_complete(tmp_path):
+    for name, summary in {"a": {"interrupted": False}, "b": {"interrupted": True}, "c": {}}.items():
+        assert is_complete(put(tmp_path / name, json.dumps(summary))) is (name == "a")
+    assert not is_complete(tmp_path / "missing")
 
 
 def test_a_folder_that_was_made_for_nothing_goes_again(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from geogs.application.results.surfaces import write_stage
 from geogs.application.run_settings import RunSettings
 from geogs.cli.main import main
 from geogs.config import Config, InputConfig, MeshConfig
-from geogs.errors import OutputError
+from geogs.errors import DeviceError, OutputError
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh, write_splats
@@ -98,9 +99,11 @@ class SavedWork(Work):
         self.scene = scene
         self.source = open_source([images], InputConfig(intrinsics="70,72,40,29"))
 
+    outcome = Outcome.FINISHED
+
     def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
         write_stage(new, self.scene, driver.progress, "online")
-        return Outcome.FINISHED
+        return self.outcome
 
 
 @pytest.fixture(scope="module")
@@ -279,3 +282,25 @@ def test_the_same_run_writes_the_same_bytes(commands, tmp_path):
     one, other = map(contents, folders)
     assert len(one) > 15
     assert same(one, other)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("outcome", [Outcome.STOPPED, Outcome.MEMORY_FULL])
+def test_an_interrupted_run_never_replaces_a_complete_result(
+    commands, tmp_path, monkeypatch, outcome
+):
+    folder = tmp_path / "kept"
+    commands["run"](folder)
+    before = contents(folder)
+    assert json.loads((folder / "summary.json").read_text())["interrupted"] is False
+    monkeypatch.setattr(SavedWork, "outcome", outcome)
+    for number in (2, 3):  # what was interrupted before is not replaced either
+        with suppress(DeviceError):
+            commands["run"](folder)
+        beside = tmp_path / f"kept-{number}"
+        assert json.loads((beside / "summary.json").read_text())["interrupted"] is True
+        assert (beside / "trajectory.tum").is_file()
+        assert contents(folder) == before
+    monkeypatch.setattr(SavedWork, "outcome", Outcome.FINISHED)
+    commands["run"](beside)  # the end of a resumed run
+    assert json.loads((beside / "summary.json").read_text())["interrupted"] is False

@@ -4,14 +4,15 @@ import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-from geogs.documents import expanded, read_json
+from geogs.application.progress.run_progress import RunProgress
+from geogs.documents import expanded, in_short, read_json
 from geogs.errors import InputError, OutputError
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs.io.writers.replacement import recover
+from geogs.io.writers.replacement import is_half_done, recover
 
 LOCK = ".geogs.lock"
 """Name of the lock file."""
@@ -81,16 +82,58 @@ def claimed(folder: Path) -> Iterator[Path]:
                 path.rmdir()
 
 
-def free_folder(wanted: Path, fingerprint: str) -> Path:
-    """The folder, or the next with a number after its name, without a result of another source.
+def chosen_folder(
+    given: Path | None, name: str, overwrite: bool, progress: RunProgress | None = None
+) -> Path:
+    """The folder for a new result: the given one, else out/NAME, or out/NAME-2 where that is taken.
 
-    ``fingerprint`` distinguishes sources of one name.
+    Args:
+        given: folder that the user named; none if they named none.
+        name: name of the source.
+        overwrite: whether an earlier result, or an unfinished run, may be replaced.
+        progress: is told which folder is taken instead of ``out/NAME``.
+
+    Raises:
+        OutputError: the given folder holds a result or an unfinished run, which stays.
     """
-    for number in count(1):
-        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-        if not _is_of_another(folder, fingerprint):
-            return folder
-    raise AssertionError("count never ends")
+    wanted = given or Path("out") / name
+    held = content(wanted)
+    if overwrite or not held:
+        return wanted
+    if given is not None:
+        ways = "give another folder (-o), or --overwrite to replace it."
+        raise OutputError(f"{wanted} holds {held}; {ways}")
+    free = free_folder(wanted)
+    if progress is not None:
+        progress.write(f"{wanted} holds {held}, which stays; this result goes to {free}.")
+    return free
+
+
+def free_folder(wanted: Path) -> Path:
+    """The folder, or the next with a number after its name, that holds no result."""
+    numbered = (wanted.with_name(f"{wanted.name}-{number}") for number in count(2))
+    return next(folder for folder in chain([wanted], numbered) if not content(folder))
+
+
+def content(folder: Path) -> str:
+    """What a new result would replace in a folder, in words; empty where that is nothing."""
+    folder = expanded(folder)
+    if os.path.lexists(folder / "summary.json") or is_half_done(folder):
+        source = _source_of(folder)
+        return f"the result of {source}" if source else "a result"
+    from geogs.application.checkpoints.checkpoint import has_checkpoint
+
+    if folder.is_dir() and has_checkpoint(folder):
+        return f"an unfinished run (geogs run --resume {folder} continues it)"
+    return ""
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether a folder holds a result that was made to its end."""
+    try:
+        return read_summary(folder).get("interrupted") is False
+    except InputError:
+        return False
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -102,23 +145,9 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return summary
 
 
-def _is_of_another(folder: Path, fingerprint: str) -> bool:
-    if not folder.is_dir():
-        return False
-    from geogs.application.checkpoints.checkpoint import has_checkpoint
-
+def _source_of(folder: Path) -> str:
+    """Name of the source of a result, as its summary has it; empty where it has none."""
     try:
-        summary = read_json(folder / "summary.json")
+        return in_short(str(read_summary(folder).get("source", "")) or " ").strip()
     except InputError:
-        return has_checkpoint(folder) and _begun_with(folder) not in (None, fingerprint)
-    return not isinstance(summary, dict) or summary.get("fingerprint") != fingerprint
-
-
-def _begun_with(folder: Path) -> str | None:
-    """Fingerprint of an unfinished run's source; none where that is not known."""
-    from geogs.application.checkpoints.run_state import SavedRun
-
-    try:
-        return SavedRun(folder).metadata.fingerprint
-    except InputError:
-        return None
+        return ""

@@ -14,7 +14,7 @@ from geogs.errors import InputError
 from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.live.live_reader import LiveReader
-from geogs.io.sources.reader import RawFrame, fingerprint_of
+from geogs.io.sources.reader import RawFrame, fingerprint_of, without_ending
 from geogs.io.sources.working_images import WorkingImages
 from geogs.types import FoundLens, Frame
 
@@ -120,6 +120,9 @@ class Source:
         self._recordings = tuple(recordings)
         self.name = " + ".join(images.name for images in recordings)
         """Names of the sequences."""
+        stems = (without_ending(images.name, images.reader.paths) for images in recordings)
+        self.stem = " + ".join(stems)
+        """The same without the endings of files, for a folder of results."""
         self.kind = first.reader.info.kind
         """The format of the first: video, images, bag, replica, tum or 7scenes."""
         self.camera = first.camera

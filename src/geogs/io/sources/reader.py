@@ -166,6 +166,12 @@ def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T
     return ordered_map(read, places, READERS, "read-ahead")
 
 
+def without_ending(name: str, files: Iterable[Path]) -> str:
+    """The name of a sequence, without its ending where it is that of one of these files."""
+    is_file = any(path.name == name and path.is_file() for path in files)
+    return Path(name).stem if is_file else name
+
+
 def fingerprint_of(paths: Sequence[Path]) -> str:
     """Sixteen digits that depend on the names and sizes of files."""
     sizes = [(p.name, -1 if (size := size_of(p)) is None else size) for p in paths]
