@@ -30,5 +30,5 @@ def test_kernels_of_the_run_are_compiled_from_the_room_on(tmp_path, monkeypatch)
     monkeypatch.setattr(compilation, "compiling", compiling)
     monkeypatch.setattr(demo, "find_command", command)
     monkeypatch.setattr(run, "main", run_with)
-    assert demo.main(["-o", str(tmp_path)]) == 0
+    assert demo.main(["-o", str(tmp_path)]).code == 0
     assert events == ["begun", "synth", kernels, "eval", "stopped"]

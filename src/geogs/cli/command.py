@@ -8,6 +8,7 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from geogs.cli.answer import Answer
 from geogs.errors import InputError
 
 GROUP = "geogs.commands"
@@ -16,15 +17,18 @@ GROUP = "geogs.commands"
 
 @dataclass(frozen=True)
 class Command:
-    """A sub-command: the module whose ``main(argv) -> exit code`` runs it, and a line of help."""
+    """A sub-command: the module whose ``main(argv)`` runs it, and a line of help.
+
+    That function returns an exit code, or an :class:`Answer`, which is printed as text or as JSON.
+    """
 
     module: str
     help: str
 
-    def run(self, argv: Sequence[str]) -> int:
-        """Run the command; returns the exit code."""
-        code: int = importlib.import_module(self.module).main(argv)
-        return code
+    def run(self, argv: Sequence[str]) -> Answer | int:
+        """Run the command; returns its answer, or the exit code alone."""
+        answer: Answer | int = importlib.import_module(self.module).main(argv)
+        return answer
 
 
 COMMANDS = {

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 from geogs.cli import run
+from geogs.cli.answer import Answer, shown
 from geogs.cli.command import find_command
 from geogs.cli.options import parse_options
 from geogs.config import Seed
 from geogs.config.setting import Basic, Range, Settings
-from geogs.terminal_text import say
+from geogs.terminal_text import printable, say
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,12 @@ class DemoOptions(Settings):
     """Another seed makes another room."""
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str]) -> Answer | int:
+    """Run the command; returns its answer."""
     return demo(parse_options(DemoOptions, argv, "demo"))
 
 
-def demo(options: DemoOptions) -> int:
+def demo(options: DemoOptions) -> Answer | int:
     """Run the three commands in turn; the second one's kernels are compiled during the first."""
     from geogs.application.machine.compilation import compiling
     from geogs.gpu.installation import require_device
@@ -45,16 +46,18 @@ def demo(options: DemoOptions) -> int:
     sizes = list[str]()
     for name in ("frames", "width", "height", "seed"):
         sizes += [f"--{name}", str(getattr(options, name))]
+    run_words = [room, "-o", result, "--overwrite", "--no-strict"]
     with compiling(require_device("auto")) as kernels:
-        steps: dict[str, tuple[Callable[[Sequence[str]], int], list[str]]] = {
+        steps: dict[str, tuple[Callable[[Sequence[str]], Answer | int], list[str]]] = {
             "synth": (find_command("synth").run, [room, *sizes]),
-            "run": (partial(run.main, kernels=kernels), [room, "-o", result, "--overwrite"]),
+            "run": (partial(run.main, kernels=kernels), run_words),
             "eval": (find_command("eval").run, [result, "--gt", room]),
         }
         for name, (command, arguments) in steps.items():
             say(f"$ geogs {name} {' '.join(arguments)}")
-            code = command(arguments)
+            code = shown(command(arguments))
             if code:
                 return code
-    say(f"Open {result}/report/index.html in a browser.")
-    return 0
+    page = options.output / "result" / "report" / "index.html"
+    words = f"Open {printable(page)} in a browser."
+    return Answer(words, {"folder": options.output, "page": page})

@@ -1,8 +1,9 @@
 """``geogs doctor``: diagnosis of this machine, and problems to fix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
+from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
 from geogs.terminal_text import say
 
@@ -15,8 +16,8 @@ class DoctorOptions:
     """What to test: cpu, cuda or cuda:1; auto takes a GPU if one can be used."""
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns 0 if the self-test passes, else 2."""
+def main(argv: Sequence[str]) -> Answer:
+    """Run the command; its exit code is 0 if the self-test passes, else 2."""
     options = parse_options(DoctorOptions, argv, "doctor")
 
     from geogs.application.machine.doctor import examine
@@ -26,9 +27,7 @@ def main(argv: Sequence[str]) -> int:
         say(f"{finding.name:<13} {finding.text}")
         findings.append(finding)
     problems = [f.problem for f in findings if f.problem]
-    say("")
-    if problems:
-        say("To mend:", *(f"  - {problem}" for problem in problems))
-    else:
-        say("everything works")
-    return 2 if any(f.is_fatal for f in findings) else 0
+    lines = ["To mend:", *(f"  - {problem}" for problem in problems)]
+    text = "\n".join(["", *(lines if problems else ["everything works"])])
+    values = {"findings": [asdict(finding) for finding in findings]}
+    return Answer(text, values, 2 if any(f.is_fatal for f in findings) else 0)

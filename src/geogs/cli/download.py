@@ -7,9 +7,10 @@ from typing import Annotated
 
 from geogs.application.download.sequences import SEQUENCES, find_sequence
 from geogs.application.run_settings import Verbosity
+from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
-from geogs.terminal_text import say
+from geogs.terminal_text import printable
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,12 @@ class DownloadOptions(Verbosity):
     """Folder into which its folder comes."""
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str]) -> Answer:
+    """Run the command; returns its answer."""
     options = parse_options(DownloadOptions, argv, "download")
     if not options.name:
-        say(*listing().splitlines())
-        return 0
+        names = {"sequences": [sequence.name for sequence in SEQUENCES]}
+        return Answer(listing(), names)
     sequence = find_sequence(options.name)
 
     from geogs.application.download.download import download
@@ -40,8 +41,9 @@ def main(argv: Sequence[str]) -> int:
     with TerminalProgress(options) as progress:
         progress.write(f"{sequence.name}: licence {sequence.licence}, see {sequence.page}")
         place = download(sequence, options.into, progress)
-    say(f"geogs run {place} reads it, and geogs eval RESULT --gt {place} its true poses.")
-    return 0
+    name = printable(place)
+    text = f"geogs run {name} reads it, and geogs eval RESULT --gt {name} its true poses."
+    return Answer(text, {"folder": place})
 
 
 def listing() -> str:

@@ -3,17 +3,19 @@
 from collections.abc import Sequence
 
 from geogs.application.result_settings import EvalSettings
+from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
 from geogs.terminal_text import printable
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str]) -> Answer:
+    """Run the command; returns its answer."""
     options = parse_options(EvalSettings, argv, "eval")
 
     from rich.console import Console
 
     from geogs.application.evaluate import evaluate
+    from geogs.documents import read_json
     from geogs.evaluation.pages.evaluation_page import table
 
     evaluation = evaluate(options)
@@ -22,4 +24,6 @@ def main(argv: Sequence[str]) -> int:
         Console(stderr=True).print(
             printable(f"warning: {sentence}"), markup=False, style="bold red", highlight=False
         )
-    return 0
+    errors = read_json(options.output / "eval.json")
+    values = {"folder": options.output, "errors": errors, "warnings": list(evaluation.doubts)}
+    return Answer("", values)

@@ -3,15 +3,16 @@
 from collections.abc import Sequence
 
 from geogs.application.result_settings import ExportSettings
+from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
-from geogs.terminal_text import say
+from geogs.terminal_text import printable
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str]) -> Answer:
+    """Run the command; returns its answer."""
     options = parse_options(ExportSettings, argv, "export")
 
     from geogs.application.export.export import export
 
-    say(f"Written: {export(options)}")
-    return 0
+    path = export(options)
+    return Answer(f"Written: {printable(path)}", {"format": options.to, "path": path})

@@ -11,6 +11,7 @@ import resource
 import sys
 from collections.abc import Callable, Sequence
 
+from geogs.cli.answer import Answer, Record, shown, wants_json, without_json
 from geogs.cli.candidates import ASKED, matching
 from geogs.cli.command import all_commands, find_command
 from geogs.cli.terminal import process
@@ -34,18 +35,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``geogs`` with the given arguments (those of the process if none).
 
     Returns:
-        0 on success, 2 after an error of input, output or options, 130 after Ctrl-C and 143 after
-        SIGTERM, also where a result of the work so far was written.
+        0 on success, 2 after an error of input, output or options, 3 after a result that is not
+        reliable, 130 after Ctrl-C and 143 after SIGTERM, also where a result of the work so far
+        was written.
     """
     if argv is not None:
-        return _guarded(lambda: _dispatch(list(argv)))
+        return _answered(list(argv))
     process.take_over()
-    code = _guarded(lambda: _dispatch(sys.argv[1:]))
+    code = _answered(sys.argv[1:])
     process.leave(code)
     return code
 
 
-def _dispatch(arguments: list[str]) -> int:
+def _answered(arguments: list[str]) -> int:
+    """Run a command and print its answer, as text or as JSON; returns its exit code."""
+    if not wants_json(arguments):
+        return _guarded(lambda: _dispatch(arguments), shown, print_error)
+    record = Record()
+    rest = without_json(arguments)
+
+    def fail(sentence: str) -> None:
+        record.fail(sentence)
+        print_error(sentence)
+
+    with record.listening():
+        code = _guarded(lambda: _dispatch(rest), record.take, fail)
+    print(record.text(rest[0] if rest else "", code))
+    return code
+
+
+def _dispatch(arguments: list[str]) -> Answer | int:
     name, *rest = arguments or ["--help"]
     if name in ("-h", "--help", "help"):
         say(*help_text().splitlines())
@@ -91,25 +110,29 @@ def print_error(sentence: str) -> None:
     print(f"\033[31m{text}\033[0m" if is_coloured else text, file=sys.stderr)
 
 
-def _guarded(run: Callable[[], int]) -> int:
-    """Run a command; errors that a user can fix become one line and an exit code.
+def _guarded(
+    run: Callable[[], Answer | int],
+    show: Callable[[Answer | int], int],
+    fail: Callable[[str], None],
+) -> int:
+    """Run a command and show its answer; errors that a user can fix become one line and a code.
 
     Others keep their traceback, and with ``GEOGS_DEBUG=1`` all do.
     """
     try:
-        code = run()
+        code = show(run())
         sys.stdout.flush()  # detects a closed pipe here rather than at exit
         return code
     except SystemExit as stop:  # help and wrong options end this way
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_ERROR
     except KeyboardInterrupt as interrupt:
-        print_error(" ".join(["interrupted.", *map(str, interrupt.args)]).strip())
+        fail(" ".join(["interrupted.", *map(str, interrupt.args)]).strip())
         return getattr(interrupt, "code", EXIT_INTERRUPTED)
     except Exception as error:
         sentence = str(error) if isinstance(error, GeogsError) else _resource_error(error)
         if sentence is None or os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
             raise
-        print_error(sentence)
+        fail(sentence)
         return EXIT_ERROR
 
 

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geogs.application.result_settings import RemeshSettings
+from geogs.cli.answer import Answer
 from geogs.cli.options import Given, parse_options
-from geogs.terminal_text import say
+from geogs.terminal_text import printable
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str]) -> Answer:
+    """Run the command; returns its answer."""
     options = parse_options(RemeshSettings, argv, "mesh", _defaults)
 
     from geogs.application.progress.terminal_progress import TerminalProgress
@@ -17,8 +18,7 @@ def main(argv: Sequence[str]) -> int:
 
     with TerminalProgress() as progress:
         path = remesh(options, progress)
-    say(f"The mesh is {path}")
-    return 0
+    return Answer(f"The mesh is {printable(path)}", {"path": path})
 
 
 def _defaults(given: Given) -> RemeshSettings:

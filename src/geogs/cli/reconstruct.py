@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from geogs.application.run_settings import ReconstructSettings, Verbosity
+from geogs.cli.answer import Answer
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, reconstruct_preset
 from geogs.gpu.early_start import is_gpu, start_gpu
-from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class ReconstructOptions(Verbosity, ReconstructSettings):
     """Only say what the input holds and how it is read; with --poses given."""
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str]) -> Answer | int:
+    """Run the command; returns its answer."""
     begin = time.perf_counter()
     options = parse(argv)
     if options.dry_run:
@@ -49,10 +49,12 @@ def main(argv: Sequence[str]) -> int:
     # The budget counts from the start of the command.
     settings = replace(settings, budget=left_of(settings.budget, begin))
     stop = Interruption()
-    result = followed(options, lambda progress: reconstruct_to_folder(settings, progress, stop))
-    if result.can_resume:
-        say("The same command with --resume goes on from here.")
-    return stop.code if result.is_interrupted else 0
+    return followed(
+        options,
+        lambda progress: reconstruct_to_folder(settings, progress, stop),
+        stop,
+        "The same command with --resume goes on from here.",
+    )
 
 
 def parse(argv: Sequence[str]) -> ReconstructOptions:

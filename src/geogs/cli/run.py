@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, cast
 
 from geogs.application.result_settings import HERE
 from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
+from geogs.cli.answer import Answer
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, preset
@@ -44,12 +45,14 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
     settings; beside it may be given what decides nothing about poses and map: --device, --mesh,
     --checkpoint-every, --fallback, --online-results, --depth-mesh, --keyframe-images and
     --scale-from."""
+    strict: bool = True
+    """End with exit code 3 where the result is not reliable."""
     dry_run: bool = False
     """Only say what the input holds and how it is read."""
 
 
-def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
-    """Run the command; ``kernels`` is a running compilation. Returns the exit code."""
+def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | int:
+    """Run the command; ``kernels`` is a running compilation. Returns its answer."""
     options = parse(argv)
     is_live = any(live_address(source) is not None for source in options.source)
     if options.offline and is_live:
@@ -80,10 +83,13 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
     observer = _observer(options)
     has_keys = is_live and not any(str(source) == "-" for source in options.source)
     with quit_key(stop.request) if has_keys else nullcontext():
-        result = followed(options, lambda progress: go(settings, progress, stop, observer))
-    if result.can_resume:
-        say(f"geogs run --resume {result.folder} goes on from here.")
-    return stop.code if result.is_interrupted else 0
+        return followed(
+            options,
+            lambda progress: go(settings, progress, stop, observer),
+            stop,
+            "geogs run --resume {folder} goes on from here.",
+            options.strict,
+        )
 
 
 def _observer(options: LiveSettings) -> "RunObserver | None":

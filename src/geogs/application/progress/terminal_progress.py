@@ -56,6 +56,8 @@ class TerminalProgress(RunProgress):
         self._memory = ""
         self._measured = -math.inf
         self._log: logging.Handler | None = None
+        self.warnings: list[str] = []
+        """Warnings so far."""
 
     def __enter__(self) -> "TerminalProgress":
         if self._verbosity.log is not None:
@@ -86,8 +88,10 @@ class TerminalProgress(RunProgress):
         if not text:
             return
         self.note(text)
-        if text.startswith("warning") and self._verbosity.quiet:
-            _print(Console(stderr=True, highlight=False), text)
+        if text.startswith("warning: "):
+            self.warnings.append(text.removeprefix("warning: "))
+            if self._verbosity.quiet:
+                _print(Console(stderr=True, highlight=False), text)
         _print(self._bar.console, text)
 
     def expect(self, frames: int | None) -> None:

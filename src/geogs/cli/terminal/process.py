@@ -67,7 +67,8 @@ def show_warnings() -> None:
     handler.setLevel(logging.WARNING)
     escape_records(handler)
     log = logging.getLogger("geogs")
-    log.handlers[:] = [handler]
+    others = (other for other in log.handlers if not isinstance(other, logging.StreamHandler))
+    log.handlers[:] = [handler, *others]
     log.propagate = False
 
 

@@ -7,16 +7,20 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from geogs.application.run_settings import RunSettings, Verbosity
+from geogs.cli.answer import EXIT_NOT_RELIABLE, Answer
 from geogs.errors import TrackingLost
-from geogs.terminal_text import say
+from geogs.terminal_text import printable, say
 
 if TYPE_CHECKING:
+    from geogs.application.interrupt import Stop
     from geogs.application.progress.run_progress import RunProgress
     from geogs.application.results.result import Result
     from geogs.io.sources.frame_source import Source
     from geogs.io.sources.posed.posed_source import PosedSource
 
 
+FILES = ("trajectory.tum", "mesh.ply", "splats.ply", "map.safetensors", "summary.json")
+"""Files of a result that its closing message names."""
 NOT_JUDGED = "Reliability unknown: the run was interrupted before the final adjustment."
 """Message for an interrupted run."""
 
@@ -32,9 +36,21 @@ def say_input(source: "Source | PosedSource") -> None:
     say(*source.account.lines(source.found))
 
 
-def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "Result":
-    """Do the work of a command, with a line of progress on the standard error, and print the
-    closing message on the standard output.
+def followed(
+    options: Verbosity,
+    work: Callable[["RunProgress"], "Result"],
+    stop: "Stop",
+    way_on: str,
+    strict: bool = False,
+) -> Answer:
+    """Do the work of a command, with a line of progress on the standard error.
+
+    Args:
+        options: how much is said.
+        work: makes and writes the result.
+        stop: the request to stop that the work heeds.
+        way_on: the command that goes on with an interrupted result, as ``{folder}``'s.
+        strict: whether the exit code tells that the result is not reliable.
 
     Raises:
         TrackingLost: uninterrupted work ended without a mesh; the other files are kept.
@@ -57,14 +73,31 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "
             took = result.scene.stopwatch.total
             said = remedy(options, result.source, result.verdict, took)
             words += [f"What may help: {said}"] if said else []
+        words += [way_on.format(folder=printable(result.folder))] if result.can_resume else []
         for line in words:
             progress.note(line)
-    if not options.quiet:
-        say(*words)
+    judged = result.verdict
+    is_doubtful = judged is not None and not judged.is_reliable
+    if judged is not None and is_doubtful and options.quiet:
+        say(f"warning: {judged.sentence}", is_error=True)
     if result.mesh is None and not result.is_interrupted:
         why = result.why_no_map or "Of what was seen no surface is known."
         raise TrackingLost(f"There is no mesh; the rest is in {result.folder}/. {why}")
-    return result
+    code = EXIT_NOT_RELIABLE if is_doubtful and strict else 0
+    code = stop.code if result.is_interrupted else code
+    values = {**result_values(result), "warnings": progress.warnings}
+    return Answer("" if options.quiet else "\n".join(words), values, code)
+
+
+def result_values(result: "Result") -> dict[str, object]:
+    """A result for a program: its folder, its files, and its summary with the verdict."""
+    from geogs.application.results.output_folder import read_summary
+
+    folder = result.folder
+    assert folder is not None, "it has been written"
+    files = {name: folder / name for name in (*FILES, "report/index.html")}
+    there = {name: path for name, path in files.items() if path.is_file()}
+    return {"folder": folder, "files": there, **read_summary(folder)}
 
 
 def closing_message(result: "Result", seconds: float) -> list[str]:
@@ -83,8 +116,7 @@ def closing_message(result: "Result", seconds: float) -> list[str]:
     parts = [f"{len(result.keyframes.timestamps)} keyframes", f"{len(result.map)} disks"]
     parts += [] if mesh is None else [f"{len(mesh.faces)} triangles"]
     lines.append(f"{result.scene.frames} frames in {duration(seconds)}: {', '.join(parts)}.")
-    there = ["trajectory.tum", "mesh.ply", "splats.ply", "map.safetensors", "summary.json"]
-    there = [name for name in there if (output / name).is_file()]
+    there = [name for name in FILES if (output / name).is_file()]
     lines.append(f"Results are in {output}/: {', '.join(there)}")
     page = output / "report" / "index.html"
     if page.is_file():
