@@ -4,10 +4,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import get_args
 
+from geogs.cli.help import is_shown_first
 from geogs.config.leaves import Leaf, default_text, leaves
 from geogs.config.reconstruct_config import ReconstructConfig, reconstruct_preset
 from geogs.config.run_config import Config, Preset, preset
-from geogs.config.setting import Basic, Only, Settings
+from geogs.config.setting import Only, Settings
 
 _INTRODUCTION = """\
 # Settings
@@ -19,7 +20,8 @@ No setting is needed. On the command line a setting is an option with its dotted
 (`--mapping.depth.planes 200`; a switch is turned off by `--mesh.no-colour`; numbers of a list
 have commas between them), from Python a field of the same name
 (`Config(mapping=MappingConfig(window=6))`). A value outside its range is refused when the settings
-are made. The settings of a result stand in its `config.yaml`.
+are made. The settings of a result stand in its `config.yaml`, which `--config` takes;
+`--print-config` shows those of a command.
 
 `geogs run --help` and `geogs reconstruct --help` show the options in **bold**, `--help-all` all of
 them. Settings that only one of the two commands heeds say so, and the other does not offer them.
@@ -70,7 +72,7 @@ def _row(leaf: Leaf, run: Leaf | None, known_poses: Leaf | None) -> list[str]:
     where = "Python" if only and only.command == "python" else _code(only.command if only else "")
     beside = f" ({where} only)" if only else ""
     name = _code(leaf.name)
-    name = f"**{name}**" if leaf.mark(Basic) or not leaf.group else name
+    name = f"**{name}**" if is_shown_first(leaf) else name
     return [name, default, str(leaf.kind), leaf.help + beside]
 
 

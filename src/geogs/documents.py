@@ -67,6 +67,10 @@ def open_file(path: str | Path) -> Iterator[BufferedReader]:
     if "\0" in name:
         raise InputError("A file name with a zero byte in it cannot be that of a file.")
     try:
+        os.fsencode(name)
+    except UnicodeEncodeError:
+        raise InputError("No file can have that name; it has broken characters.") from None
+    try:
         with open(path, "rb", opener=_without_waiting) as stream:
             if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
                 raise InputError(f"{name} is no plain file; give one.")

@@ -8,7 +8,7 @@ import pytest
 
 from geogs.application.result_settings import EvalSettings
 from geogs.cli import reconstruct, run
-from geogs.cli.help import help_text
+from geogs.cli.help import help_text, is_shown_first
 from geogs.cli.options import parse_options
 from geogs.config.leaves import leaves
 from geogs.config.setting import Basic, Only, Positional, Range, Settings, Unnamed
@@ -45,7 +45,7 @@ class Outer:
     Two lines of help.
     """
 
-    source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
+    source: Annotated[tuple[Path, ...], Positional(unless=("resume",))] = ()
     """What to read."""
     inner: Annotated[Inner, Unnamed] = field(default_factory=Inner)
     resume: Annotated[Path | None, Basic("-r")] = None
@@ -167,12 +167,19 @@ def test_help_shows_the_basic_options_and_the_rest_on_demand(capsys) -> None:
     ("options", "command"),
     [(run.RunOptions, "run"), (reconstruct.ReconstructOptions, "reconstruct")],
 )
-def test_some_40_options_at_most_are_basic(options: type, command: str) -> None:
+def test_the_common_options_fit_on_a_screen(options: type, command: str) -> None:
     known = leaves(options, command)
-    basic = [leaf for leaf in known if not leaf.group or leaf.mark(Basic) is not None]
-    assert 20 <= len(basic) <= 48
-    assert len(known) > 2 * len(basic)
+    common = [leaf for leaf in known if is_shown_first(leaf)]
+    assert 15 <= len(common) <= 32
+    text = help_text(options, command, everything=False)
+    assert len(text.splitlines()) <= 45
+    assert max(map(len, text.splitlines())) <= 100
+    for leaf in common:
+        assert leaf.mark(Positional) or f"{leaf.options[-1]}" in text or leaf.default is True
+    full = help_text(options, command, everything=True)
+    assert all(leaf.name in full for leaf in known if leaf.kind.base is not bool and leaf.options)
     assert all(leaf.help for leaf in known)
+    basic = [leaf for leaf in known if leaf.mark(Basic) is not None]
     names = [leaf.name for leaf in known]
     names += [leaf.mark(Basic).name for leaf in basic if leaf.mark(Basic) and leaf.mark(Basic).name]
     assert len(set(names)) == len(names)

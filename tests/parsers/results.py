@@ -15,7 +15,9 @@ from geogs.application.results.output_folder import chosen_folder
 from geogs.application.results.result_page import shown_model, shown_views, write_page_anew
 from geogs.application.results.revise import mesh_settings
 from geogs.application.results.saved_result import load_result
+from geogs.application.settings_file import read_settings
 from geogs.camera.shutter.rows import CELL
+from geogs.config import ReconstructConfig
 from geogs.evaluation.pages.run_page import lengths
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source
@@ -53,6 +55,7 @@ def results() -> dict[str, Parser]:
         "map": ("map.safetensors", mutations.safetensors, whole),
         "map-shown": ("map.safetensors", mutations.safetensors, shown),
         "config-of-a-result": ("config.yaml", mutations.yaml_text, whole),
+        "config-given": ("config.yaml", mutations.yaml_text, given),
         "trajectory-of-a-result": ("trajectory.tum", mutations.text, whole),
         "trajectory-shown": ("trajectory.tum", mutations.text, shown),
         "uncertainty-of-a-result": ("trajectory_uncertainty.csv", mutations.text, whole),
@@ -75,6 +78,11 @@ def results() -> dict[str, Parser]:
     masks = ("out/masks/000003.jpg.png",)
     found["export-colmap"] = Parser(colmap, model + masks, mutations.binary, read_back)
     return found
+
+
+def given(folder: Path) -> None:
+    """What ``--config`` reads."""
+    read_settings(folder / "config.yaml", ReconstructConfig())
 
 
 def complete(folder: Path) -> None:

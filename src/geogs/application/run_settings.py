@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from geogs.application.named_files import with_absolute_paths
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import (
+    RARE,
     Basic,
     Port,
     Positional,
@@ -26,41 +27,42 @@ from geogs.config.setting import (
 class RunSettings(Settings):
     """Settings of a run: what it reads, how it computes, what it writes."""
 
-    source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
-    """Video file or folder; several of one place, by one camera, make one map. Or what does not
-    wait: camera:0, rtsp://HOST/PATH, - (raw frames from a pipe), play:FILE (a file at its pace)."""
+    source: Annotated[tuple[Path, ...], Positional(unless=("resume", "print-config"))] = ()
+    """Video, folder or data set; several of one place, by one camera, make one map. Or what does
+    not wait: camera:0, rtsp://HOST/PATH, - (raw frames from a pipe), play:FILE (a file at its
+    pace)."""
     config: Annotated[Config, Unnamed] = field(default_factory=Config)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
-    """Folder for the results; out/NAME if none is given, or out/NAME-2 where that is taken."""
+    """Folder for the results; without it out/NAME, or out/NAME-2 where that is taken."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
-    checkpoint_every: Weight = 60.0
+    checkpoint_every: Annotated[Weight, RARE] = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
     map: Annotated[Path | None, Basic()] = None
-    """Folder of an earlier result of the same place and camera: localise in its map, which stays
-    where it is, and add to it."""
+    """Folder of an earlier result to localise in: of the same place and camera; its map stays where
+    it is, and the new one adds to it."""
     scale_from: Annotated[str, Basic()] = ""
-    """What is known in metres, so that the result is in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of
+    """What is known in metres; the result is then in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of
     an image as it came; several with semicolons), aruco:DICT_5X5_50:0.12 (tags whose side is so
     long), height:1.6 (of the camera over the ground), or sensor (with --depth)."""
     offline: bool = False
     """Do not track: place sharp frames by structure from motion (pycolmap) and all others against
     them; for videos that tracking cannot follow."""
-    fallback: bool = True
+    fallback: Annotated[bool, RARE] = True
     """Look for lost frames about those that were tracked, and where much was lost, or nothing to be
     relied on, also place all frames as --offline does, and keep what is better (pip install
     'geogs[photos]')."""
-    online_results: bool = False
+    online_results: Annotated[bool, RARE] = False
     """Also write trajectory and mesh as they are after the stream, to online/, and after the final
     bundle adjustment and the map's update, to adjusted/, where a refinement follows; all appear
     at the run's end, with the result."""
-    depth_mesh: bool = False
+    depth_mesh: Annotated[bool, RARE] = False
     """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
-    keyframe_images: bool = True
+    keyframe_images: Annotated[bool, RARE] = True
     """Keep the images of the keyframes in keyframes/, which geogs mesh and geogs export use."""
     overwrite: bool = False
-    """Replace the result that is in the folder, once the new one is complete."""
+    """Replace the result that is in the folder; it stays until the new one is complete."""
 
     def absolute(self) -> "RunSettings":
         """The same with absolute paths, and without an output folder."""
@@ -79,37 +81,37 @@ class RunSettings(Settings):
 class ReconstructSettings(Settings):
     """Settings of a reconstruction from known poses."""
 
-    source: Annotated[Path, Positional()] = Path()
+    source: Annotated[Path, Positional(unless=("print-config",))] = Path()
     """Folder of images with poses, or the file with the poses; with --poses auto a folder of
     photographs."""
     config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
-    """Folder for the results; out/NAME if none is given, or out/NAME-2 where that is taken."""
+    """Folder for the results; without it out/NAME, or out/NAME-2 where that is taken."""
     budget: Annotated[float | None, Range(above=0), Time] = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
     poses: Literal["given", "auto"] = "given"
     """given with the images, or auto: found from the photographs alone, by pycolmap."""
-    check_poses: bool = True
+    check_poses: Annotated[bool, RARE] = True
     """Whether to see by matching images that the poses follow the expected convention."""
-    hold_out: Annotated[int | None, Range(2)] = None
+    hold_out: Annotated[int | None, Range(2), RARE] = None
     """Leave out every so many-th image, to judge the result by; none uses all."""
-    snapshots: Annotated[tuple[Positive, ...], Time] = ()
+    snapshots: Annotated[tuple[Positive, ...], Time, RARE] = ()
     """Also keep the map as it stands after some seconds, such as 5,10,20, in snapshots/; they count
     from when the images have been read."""
-    depth_mesh: bool = False
+    depth_mesh: Annotated[bool, RARE] = False
     """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
-    keyframe_images: bool = True
+    keyframe_images: Annotated[bool, RARE] = True
     """Keep the images as they were used in keyframes/, which geogs mesh and geogs export use."""
     resume: bool = False
     """Go on from the checkpoint that an earlier call left in the output folder."""
-    checkpoint_every: Weight = 30.0
+    checkpoint_every: Annotated[Weight, RARE] = 30.0
     """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
     none."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     overwrite: bool = False
-    """Replace the result that is in the folder, once the new one is complete."""
+    """Replace the result that is in the folder; it stays until the new one is complete."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,9 @@ class LiveSettings(Settings):
 
     viewer: bool = False
     """Show the run in the browser while it goes on; needs pip install 'geogs[viewer]'."""
-    viewer_port: Port = 8080
+    viewer_port: Annotated[Port, RARE] = 8080
     """Where that page is served, to this machine alone; if it is taken, the next that is free."""
-    record: Path | None = None
+    record: Annotated[Path | None, RARE] = None
     """Also record the run in this file, .rrd, for the rerun viewer; needs pip install
     'geogs[record]'."""
 
@@ -130,8 +132,8 @@ class Verbosity(Settings):
     """Verbosity on the terminal, and the log file."""
 
     verbose: Annotated[bool, Basic("-v")] = False
-    """Say how long each phase took, and what else there is to know."""
+    """Say more, such as how long each phase took."""
     quiet: Annotated[bool, Basic("-q")] = False
     """Say nothing but warnings and errors."""
-    log: Annotated[Path | None, Basic()] = None
+    log: Annotated[Path | None, RARE] = None
     """File to which everything is also written, with the time of day; added to if it exists."""

@@ -13,7 +13,7 @@ from geogs.terminal_text import say
 
 JSON = "--json"
 """Option of every command: one JSON object on the standard output, in place of sentences."""
-JSON_HELP = "Print one JSON object in place of text: paths, numbers, warnings, the exit code."
+JSON_HELP = "Print one JSON object in place of text."
 EXIT_NOT_RELIABLE = 3
 """Exit code after a result that is not reliable, by its own verdict."""
 

@@ -7,17 +7,20 @@ option that is a tuple of texts can be repeated.
 """
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+import logging
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar
 
 from geogs.cli.candidates import ASKED, candidates, matching
 from geogs.cli.help import first_clause, help_text
-from geogs.config.leaves import Leaf, default_of, leaves
+from geogs.config.leaves import Leaf, default_of, former_words, leaves
 from geogs.config.setting import Positional, dashed, group_of, refusal
 from geogs.errors import InputError
 from geogs.terminal_text import say
 
+_log = logging.getLogger(__name__)
 Options = TypeVar("Options")
 Record = TypeVar("Record")
 Given = Mapping[str, str]
@@ -45,7 +48,7 @@ def parse_options(
     """
     known = leaves(options, command)
     _say_what_is_asked(options, known, argv, command)
-    words, given = _named(known, argv, command)
+    words, given = _named(known, _renamed(known, argv), command)
     for leaf in known:
         if words and leaf.mark(Positional) is not None:
             taken = len(words) if leaf.kind.is_tuple else 1
@@ -87,8 +90,29 @@ def _say_what_is_asked(
     raise SystemExit(0)
 
 
+def _renamed(known: Sequence[Leaf], argv: Sequence[str]) -> Iterator[str]:
+    """The arguments with new names for old ones, and a warning for each of these."""
+    former = former_words(known)
+    arguments = list(argv)
+    while arguments:
+        word = arguments.pop(0)
+        if word == "--":
+            yield from (word, *arguments)
+            return
+        name, equals, text = word.partition("=")
+        name = dashed(name)
+        pair = f"{name} {text if equals or not arguments else arguments[0]}"
+        old = pair if pair in former else name
+        if old == pair and not equals:
+            arguments.pop(0)
+        if old in former:
+            _log.warning("%s is now %s; the old name goes in the next version.", old, former[old])
+            word = former[old] if old == pair else former[old] + equals + text
+        yield word
+
+
 def _named(
-    known: Sequence[Leaf], argv: Sequence[str], command: str
+    known: Sequence[Leaf], argv: Iterable[str], command: str
 ) -> tuple[list[str], dict[str, list[str]]]:
     """Positional words, and the values of options by their dotted names."""
     names = {name: leaf for leaf in known for name in leaf.options}
@@ -127,7 +151,7 @@ def _is_needed(leaf: Leaf, given: Mapping[str, object]) -> bool:
     mark = leaf.mark(Positional)
     if mark is None:
         return leaf.default is MISSING
-    return mark.required and mark.unless not in given
+    return mark.required and given.keys().isdisjoint(mark.unless)
 
 
 def _value(leaf: Leaf, texts: list[str]) -> object:

@@ -7,6 +7,7 @@ from typing import cast
 
 from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.answer import Answer
+from geogs.cli.config_options import ConfigOptions, printed, with_settings_file
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, reconstruct_preset
@@ -14,7 +15,7 @@ from geogs.gpu.early_start import is_gpu, start_gpu
 
 
 @dataclass(frozen=True)
-class ReconstructOptions(Verbosity, ReconstructSettings):
+class ReconstructOptions(Verbosity, ConfigOptions, ReconstructSettings):
     """Reconstruct images whose poses are known: a COLMAP model, nerfstudio, DTU, Replica, TUM...
 
     Lengths of the result are in the unit of the poses. Every default works. Photographs without
@@ -22,8 +23,8 @@ class ReconstructOptions(Verbosity, ReconstructSettings):
     """
 
     preset: Preset = "default"
-    """Group of settings; single ones given beside it win. Without it, accurate on a GPU and default
-    on a CPU."""
+    """Group of settings: those of --config and single ones win. Without it, accurate on a GPU and
+    default on a CPU."""
     dry_run: bool = False
     """Only say what the input holds and how it is read; with --poses given."""
 
@@ -32,6 +33,8 @@ def main(argv: Sequence[str]) -> Answer | int:
     """Run the command; returns its answer."""
     begin = time.perf_counter()
     options = parse(argv)
+    if options.print_config:
+        return printed(options.config)
     if options.dry_run:
         from geogs.io.sources.posed.pose_check import with_focal_length
         from geogs.io.sources.sniff import open_posed_source
@@ -73,4 +76,5 @@ def _defaults(given: Given) -> ReconstructOptions:
     if asked is None:
         asked = "accurate" if is_gpu(given.get("device", "auto")) else "default"
     name = cast(Preset, asked)
-    return ReconstructOptions(config=reconstruct_preset(name), preset=name)
+    config = with_settings_file(reconstruct_preset(name), given)
+    return ReconstructOptions(config=config, preset=name)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, cast
 from geogs.application.result_settings import HERE
 from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.answer import Answer
+from geogs.cli.config_options import ConfigOptions, printed, with_settings_file
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.terminal.speech import followed, say_input, say_loading
 from geogs.config import Preset, preset
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RunOptions(LiveSettings, Verbosity, RunSettings):
+class RunOptions(LiveSettings, Verbosity, ConfigOptions, RunSettings):
     """Reconstruct a video, images, a bag of ROS, or a sequence of a data set as it lies on disk.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
@@ -39,21 +40,22 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
     """
 
     preset: Preset = "default"
-    """Group of settings; single ones given beside it win."""
+    """Group of settings: those of --config and single ones win."""
     resume: Path | None = None
-    """Go on with the run that was interrupted or killed in this folder, with its source and its
-    settings; beside it may be given what decides nothing about poses and map: --device, --mesh,
-    --checkpoint-every, --fallback, --online-results, --depth-mesh, --keyframe-images and
-    --scale-from."""
+    """Go on with the run that stopped in this folder: with its source and its settings; beside it
+    may be given what decides nothing about poses and map: --device, --mesh, --checkpoint-every,
+    --fallback, --online-results, --depth-mesh, --keyframe-images and --scale-from."""
     strict: bool = True
-    """End with exit code 3 where the result is not reliable."""
+    """End with exit code 3 if the result is not reliable."""
     dry_run: bool = False
-    """Only say what the input holds and how it is read."""
+    """Only say what the input holds and would be done."""
 
 
 def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | int:
     """Run the command; ``kernels`` is a running compilation. Returns its answer."""
     options = parse(argv)
+    if options.print_config:
+        return printed(options.config)
     is_live = any(live_address(source) is not None for source in options.source)
     if options.offline and is_live:
         raise InputError("--offline reads a video several times; a live source comes but once.")
@@ -128,13 +130,14 @@ def _defaults(given: Given) -> RunOptions:
         name = cast(Preset, given.get("preset", "default"))
         is_live = live_address(Path(given.get("source", ""))) is not None
         on_gpu = name == "default" and not is_live and is_gpu(given.get("device", "auto"))
-        return RunOptions(config=preset(name, on_gpu), preset=name)
+        return RunOptions(config=with_settings_file(preset(name, on_gpu), given), preset=name)
 
     from geogs.application.checkpoints.run_state import SavedRun
 
     folder = Path(given["resume"])
-    if "preset" in given:
-        raise InputError("--resume goes on with the run's settings; leave out --preset.")
+    for option, name in (("--preset", "preset"), ("--config", "config-file")):
+        if name in given:
+            raise InputError(f"--resume goes on with the run's settings; leave out {option}.")
     return RunOptions(**vars(SavedRun(folder).settings), resume=folder)
 
 

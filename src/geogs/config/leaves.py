@@ -5,11 +5,21 @@ import functools
 import inspect
 import itertools
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeVar, get_args
 
-from geogs.config.setting import Basic, Kind, Only, Positional, Unnamed, dashed, group_of, kinds
+from geogs.config.setting import (
+    Basic,
+    Formerly,
+    Kind,
+    Only,
+    Positional,
+    Unnamed,
+    dashed,
+    group_of,
+    kinds,
+)
 
 T = TypeVar("T")
 
@@ -63,6 +73,12 @@ def leaves(tree: object, command: str = "") -> tuple[Leaf, ...]:
         for leaf in _leaves(tree, (), "")
         if not command or (only := leaf.mark(Only)) is None or only.command == command
     )
+
+
+def former_words(known: Iterable[Leaf]) -> dict[str, str]:
+    """Words of the command line that went in the last version, with those in their place."""
+    marks = (leaf.mark(Formerly) for leaf in known)
+    return {old: new for mark in marks if mark for old, new in mark.words.items()}
 
 
 def with_values(tree: T, values: Mapping[tuple[str, ...], object]) -> T:

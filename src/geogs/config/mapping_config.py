@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 from geogs.config.loss_config import LossConfig
 from geogs.config.setting import (
     Angle,
-    Basic,
     Count,
     CountOrZero,
     Fraction,
@@ -114,7 +113,7 @@ class MapAblation(Settings, group="mapping.ablation"):
 class MappingConfig(Settings, group="mapping"):
     """The disk map and its training."""
 
-    render_long_edge: Annotated[int, Range(16, 16384), Basic()] = 320
+    render_long_edge: Annotated[int, Range(16, 16384)] = 320
     """Longer side of the rendered maps in pixels; never above the working image."""
     photo_scale: Annotated[float, Range(0.1, 16)] = 2.0
     """The images of L_mv are this much larger than the render, at most the working image."""
@@ -131,9 +130,7 @@ class MappingConfig(Settings, group="mapping"):
     """Steps per keyframe."""
     views_per_step: Annotated[CountOrZero, Only("run")] = 2
     """Views of the window in each step; 0 sums the loss over the whole window as the paper does."""
-    final_iterations: Annotated[int | Literal["auto"], Range(0, 10**6), Only("run"), Basic()] = (
-        "auto"
-    )
+    final_iterations: Annotated[int | Literal["auto"], Range(0, 10**6), Only("run")] = "auto"
     """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online;
     auto: 600 on a CPU, 3000 on a GPU, where they take a few seconds."""
     final_depth: Annotated[bool, Only("run")] = True

@@ -43,7 +43,7 @@ class PriorConfig(Settings, group="prior"):
 
     model: Annotated[str, NamesFile(), Basic()] = ""
     """Network for depth (or depth and normals): a file; none does without."""
-    card: Annotated[str, NamesFile(), Basic()] = ""
+    card: Annotated[str, NamesFile()] = ""
     """Card of its input and output: the name of one that comes with geogs, or a YAML file."""
     normal_model: Annotated[str, NamesFile()] = ""
     """Another network for normals, where the first has none: a file."""

@@ -11,14 +11,14 @@ from geogs.config.mapping_config import DepthConfig, MappingConfig, PhotoConfig
 from geogs.config.mesh_config import MeshConfig
 from geogs.config.paper import paper_known_pose_mapping
 from geogs.config.run_config import Preset, Seed
-from geogs.config.setting import Basic, Count, Range, Settings
+from geogs.config.setting import RARE, Basic, Count, Range, Settings
 
 
 @dataclass(frozen=True)
 class SearchConfig(Settings, group="search"):
     """Effort for a map from known poses, and the search for depth."""
 
-    steps_per_view: Annotated[Count, Basic()] = 30
+    steps_per_view: Count = 30
     """Training steps for every image where no time is given."""
     least_steps: Count = 300
     """Fewest training steps where no time is given."""
@@ -31,7 +31,7 @@ class SearchConfig(Settings, group="search"):
     """Largest fraction of the time up to then that reading and the depths may take; images for
     which it does not last are not read, or get no depth and only serve to find those of the
     others."""
-    repeat: Annotated[bool, Basic()] = True
+    repeat: bool = True
     """Search all depths a second time, between the limits that the first time has shown."""
 
 
@@ -58,9 +58,9 @@ def known_pose_mapping() -> MappingConfig:
 class ReconstructConfig(Settings):
     """All settings of a reconstruction from known poses."""
 
-    seed: Seed = 0
+    seed: Annotated[Seed, RARE] = 0
     """Random seed; same seed, same machine and no time limit, same result on the CPU."""
-    resident_keyframes: Count = 128
+    resident_keyframes: Annotated[Count, RARE] = 128
     """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
     others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)

@@ -9,7 +9,7 @@ from geogs.config.mapping_config import MappingConfig
 from geogs.config.mesh_config import MeshConfig
 from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior, paper_tracking
 from geogs.config.prior_config import DepthSensorConfig, OdometryConfig, PriorConfig
-from geogs.config.setting import Count, Range, Settings
+from geogs.config.setting import RARE, Count, Range, Settings
 from geogs.config.tracking_config import CalibrationConfig, LoopConfig, TrackingConfig
 
 Preset = Literal["default", "fast", "accurate", "paper"]
@@ -20,9 +20,9 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 class Config(Settings):
     """All settings of a run."""
 
-    seed: Seed = 0
+    seed: Annotated[Seed, RARE] = 0
     """Random seed; same seed, same machine, same result on the CPU."""
-    resident_keyframes: Count = 128
+    resident_keyframes: Annotated[Count, RARE] = 128
     """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
     others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)

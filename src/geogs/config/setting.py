@@ -12,7 +12,7 @@ import functools
 import math
 import reprlib
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
@@ -82,10 +82,19 @@ class Range:
 
 @dataclass(frozen=True)
 class Basic:
-    """One of the few settings that ``--help`` shows; ``--help-all`` shows every one."""
+    """A setting with a shorter name, or one that ``--help`` shows or hides unlike its group.
+
+    ``--help-all`` shows every setting, ``--help`` those at the top and these.
+    """
 
     name: str = ""
     """A shorter name on the command line, such as ``--stride`` or ``-o``."""
+    is_common: bool = True
+    """Whether ``--help`` shows it."""
+
+
+RARE = Basic(is_common=False)
+"""Mark of a setting at the top that only ``--help-all`` shows."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +112,8 @@ class Positional:
     """An option that is given without its name, in the order of the fields."""
 
     required: bool = True
-    unless: str = ""
-    """Option with which it may be left out all the same."""
+    unless: tuple[str, ...] = ()
+    """Options with which it may be left out all the same."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +121,16 @@ class NamesFile:
     """A text that may be the name of a file, where it is none of these words."""
 
     words: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Formerly:
+    """Words of the command line by which an option went in the last version, each with the new one.
+
+    A word may have a value after it: ``--poses auto``. They go with the next version.
+    """
+
+    words: Mapping[str, str]
 
 
 class Time:

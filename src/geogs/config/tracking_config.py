@@ -24,9 +24,9 @@ class CalibrationConfig(Settings, group="calibration"):
     matches, and both halves of the video, clearly contradict them.
     """
 
-    refine: Annotated[bool, Basic()] = True
+    refine: bool = True
     """Whether a guessed focal length, or one from EXIF, is refined before the run."""
-    radial: Annotated[bool, Basic()] = True
+    radial: bool = True
     """Find the distortion with it (OpenCV's k1 and k2), unless that is given, and undistort the
     images by it. Off for a lens that bends nothing."""
 
@@ -38,12 +38,10 @@ class TrackingConfig(Settings, group="tracking"):
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
-    operator: Annotated[Literal["auto", "classical", "own", "droid", "droid_if_found"], Basic()] = (
-        "auto"
-    )
+    operator: Literal["auto", "classical", "own", "droid", "droid_if_found"] = "auto"
     """Estimator of image motion; auto takes classical, which needs no weights; droid_if_found
     takes droid, or classical where it finds no droid.pth."""
-    weights: Annotated[str, NamesFile(), Basic()] = ""
+    weights: Annotated[str, NamesFile()] = ""
     """File with the operator's weights; empty searches for one (geogs weights shows where)."""
     keyframe_parallax: Fraction = 0.018
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge,
@@ -81,7 +79,7 @@ class LoopConfig(Settings, group="loop"):
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
-    enabled: Annotated[bool, Basic()] = True
+    enabled: bool = True
     """Search for loops and close them, and recognise keyframes when the camera is lost."""
     min_gap: Count = 15
     """Keyframes that lie at least between the two views of a loop."""
@@ -99,5 +97,5 @@ class LoopConfig(Settings, group="loop"):
     min_change: Annotated[Weight, Only("python")] = 0.002
     """Corrections that move no keyframe by more than this are not worth it for the map: radians,
     parts of its median depth, or of its scale."""
-    global_ba_every: Annotated[CountOrZero, Basic("--global-ba-every")] = 0
+    global_ba_every: Annotated[CountOrZero, Basic("--global-ba-every", is_common=False)] = 0
     """Keyframes between two bundle adjustments of all keyframes; 0 leaves that to the end."""

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
@@ -12,6 +11,7 @@ from geogs.application.results.result import Result
 from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.summary import summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
+from geogs.application.settings_file import settings_text
 from geogs.config import Config, ReconstructConfig
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
@@ -113,8 +113,5 @@ def _write_pictures(output: Path, result: Result, shown: Sequence[RenderedKeyfra
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:
-    """Write all settings as YAML."""
-    import yaml
-
-    plain = json.loads(json.dumps(asdict(config), default=str))
-    write_text(path, yaml.safe_dump(plain, sort_keys=False))
+    """Write all settings as YAML, which ``--config`` takes."""
+    write_text(path, settings_text(config))
