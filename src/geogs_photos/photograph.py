@@ -58,7 +58,7 @@ def find_photographs(folder: str | Path) -> PhotoFolder:
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; --poses auto needs a folder of photographs.")
+        raise InputError(f"{folder} is no folder; --sfm needs a folder of photographs.")
     root = image_folder(folder)
     files = [path for path in (root.iterdir() if root else folder.rglob("*")) if path.is_file()]
     root = root or folder

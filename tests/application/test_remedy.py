@@ -44,12 +44,12 @@ def test_a_good_result_needs_none(photos):
 def test_where_structure_from_motion_was_not_tried_it_is_named(photos):
     photos(False)
     said = remedy(VIDEO, source(), LOST, 90.0)
-    assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --offline ")
+    assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --sfm ")
     photos(True)
     said = remedy(replace(VIDEO, fallback=False), source(), LOST, 90.0)
-    assert said.startswith("geogs run 'my video.mp4' --offline locates")
+    assert said.startswith("geogs run 'my video.mp4' --sfm locates")
     metric = replace(VIDEO, scale_from="height:1.6")
-    assert remedy(metric, source(), None).startswith("geogs run 'my video.mp4' --offline")
+    assert remedy(metric, source(), None).startswith("geogs run 'my video.mp4' --sfm")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_where_structure_from_motion_was_not_tried_it_is_named(photos):
             "If you know the focal length: geogs run 'my video.mp4' --intrinsics fx,fy,cx,cy, in a",
         ),
         (VIDEO, 0.0, RECORD_AGAIN),
-        (replace(VIDEO, offline=True), 0.0, RECORD_AGAIN),
+        (replace(VIDEO, sfm=True), 0.0, RECORD_AGAIN),
         (replace(VIDEO, map=Path("old")), 0.0, " makes a map of its own, in about 1 min 30"),
     ],
 )
@@ -100,4 +100,4 @@ def test_a_lens_that_changes_is_not_mended_by_a_setting(photos):
     stabilised = replace(LOST, lost=0.0, lens_varies=True)
     assert remedy(VIDEO, source(False, 0.09), stabilised, 90.0) == WITHOUT_STABILISATION
     lost = replace(LOST, lens_varies=True)
-    assert "--offline" in remedy(VIDEO, source(False, 0.09), lost, 90.0)
+    assert "--sfm" in remedy(VIDEO, source(False, 0.09), lost, 90.0)

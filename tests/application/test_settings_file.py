@@ -70,6 +70,12 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_preset(tmp_pa
     assert reconstruct.parse(given).config.input.long_edge == 300
 
 
+def test_a_former_name_is_read_from_a_file(tmp_path):
+    file = tmp_path / "old.yaml"
+    file.write_text("input: {field_of_view: 60}")
+    assert read_settings(file, Config()).input == InputConfig(working_field_of_view=60)
+
+
 def test_files_that_settings_name_are_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mask.png").touch()

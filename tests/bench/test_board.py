@@ -49,7 +49,7 @@ def test_every_row_has_its_footage_and_a_name_of_its_own(on_gpu):
 def test_the_rows_hold_what_users_do():
     commands = " ; ".join(row.command for on_gpu in (False, True) for row in rows(on_gpu))
     for words in ("--preset fast", "--preset accurate", "--preset paper", "--online-results",
-                  "--offline", "--tracking.operator own", "run play:", "run {video}",
+                  "--sfm", "--tracking.operator own", "run play:", "run {video}",
                   "reconstruct {folder} --budget"):  # fmt: skip
         assert words in commands
     assert any(row.has_empty_cache for row in rows(False))

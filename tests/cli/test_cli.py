@@ -271,3 +271,13 @@ def test_garbage_is_looked_for_again_after_the_imports():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["False 0", "True True True"]
+
+
+def test_the_package_is_a_command():
+    for arguments in (["--version"], ["weights", "nothing"]):
+        shown = [
+            subprocess.run([sys.executable, "-m", name, *arguments], capture_output=True, text=True)
+            for name in ("geogs", "geogs.cli.main")
+        ]
+        first, second = ((done.returncode, done.stdout, done.stderr) for done in shown)
+        assert first == second

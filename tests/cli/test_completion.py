@@ -68,7 +68,7 @@ def test_values_are_offered_after_the_option_they_belong_to(offered):
     assert offered("run", "--preset", "") == ["default", "fast", "accurate", "paper"]
     assert offered("run", "a.mp4", "--depth", "s") == ["sensor"]
     assert offered("weights", "v") == ["verify"]
-    assert offered("run", "--offline", "vi") == []  # a file, which the shell knows
+    assert offered("run", "--sfm", "vi") == []  # a file, which the shell knows
 
 
 def test_bash_completes(home):

@@ -10,7 +10,7 @@ from geogs.application.result_settings import EvalSettings
 from geogs.cli import reconstruct, run
 from geogs.cli.help import help_text, is_shown_first
 from geogs.cli.options import parse_options
-from geogs.config.leaves import leaves
+from geogs.config.leaves import former_words, leaves
 from geogs.config.setting import Basic, Only, Positional, Range, Settings, Unnamed
 from geogs.errors import InputError
 
@@ -79,6 +79,43 @@ def sweep(*argv: str) -> Sweep:
 )
 def test_values_are_read(argv: str, changes: dict) -> None:
     assert sweep(*argv.split()) == replace(Sweep(most=9), **changes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "command"),
+    [
+        ("--field-of-view 60", "--working-field-of-view 60", run),
+        ("--input.field_of_view=60", "--working-field-of-view 60", run),
+        ("--field-of-view=60", "--working-field-of-view 60", reconstruct),
+        ("--offline", "--sfm", run),
+        ("--no-offline", "--no-sfm", run),
+        ("--poses auto", "--sfm", reconstruct),
+        ("--poses=auto --seed 2", "--sfm --seed 2", reconstruct),
+        ("--poses given", "--no-sfm", reconstruct),
+    ],
+)
+def test_a_former_name_does_the_same_and_names_the_new_one(old, new, command, caplog) -> None:
+    expected = command.parse(["x", "--device", "cpu", *new.split()])
+    assert not caplog.messages
+    assert command.parse(["x", "--device", "cpu", *old.split()]) == expected
+    (warning,) = caplog.messages
+    assert f" is now {new.split()[0].removesuffix('=60')};" in warning.replace("input.", "")
+    assert old.split("=")[0].split()[0].replace("_", "-") in warning
+
+
+def test_a_former_name_is_offered_by_no_help_and_taken_by_no_other_option() -> None:
+    for options, command in (
+        (run.RunOptions, "run"),
+        (reconstruct.ReconstructOptions, "reconstruct"),
+    ):
+        known = leaves(options, command)
+        names = {name for leaf in known for name in leaf.options}
+        former = former_words(known)
+        assert former
+        assert not {old for old in former if " " not in old} & names
+        assert " --offline" not in help_text(options, command, everything=True)
+    assert run.parse(["x", "--poses", "auto", "--device", "cpu"]).config.input.poses == "auto"
+    assert run.parse(["--device", "cpu", "--", "--offline"]).source == (Path("--offline"),)
 
 
 def test_words_without_a_name_go_to_their_places() -> None:

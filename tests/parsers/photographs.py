@@ -16,7 +16,7 @@ from posed_layouts import write_colmap_binary, write_room_images
 
 
 def photographs() -> dict[str, Parser]:
-    """What ``geogs reconstruct --poses auto`` reads."""
+    """What ``geogs reconstruct --sfm`` reads."""
     names = ("a.jpg", "b.jpg", "c.jpg")
 
     def taken(folder: Path) -> None:

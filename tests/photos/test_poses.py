@@ -84,7 +84,7 @@ def test_the_command_goes_from_photographs_to_a_mesh(photographs, tmp_path, capf
     folder, room = photographs
     c = room.camera
     code = main([
-        "reconstruct", str(folder), "--poses", "auto", "-o", str(tmp_path), "--device", "cpu",
+        "reconstruct", str(folder), "--sfm", "-o", str(tmp_path), "--device", "cpu",
         "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}", "--search.steps-per-view", "1",
         "--search.least-steps", "20", "--search.no-repeat", "--mapping.render-long-edge", "96",
     ])  # fmt: skip

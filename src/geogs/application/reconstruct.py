@@ -130,7 +130,7 @@ def reconstruct_to_folder(
     device = require_device(settings.device)
     for sentence in idle_settings(config):
         progress.write(f"note: {sentence}")
-    finds_poses = settings.poses == "auto"
+    finds_poses = settings.sfm
     if finds_poses:
         name = expanded(settings.source).resolve().name
     else:
@@ -238,7 +238,7 @@ class MappedImages(Work):
             place = resumed.map.place
             done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
             progress.write(f"Continuing after {done}, {resumed.seconds:.0f} s into the work.")
-        checks = progress if settings.check_poses and settings.poses == "given" else None
+        checks = progress if settings.check_poses and not settings.sfm else None
 
         def report(stage: str, fraction: float) -> None:
             progress.stage(stage, fraction)

@@ -40,7 +40,7 @@ def remedy(
     again = f", in about {duration(took)}" if took else ""
     if not (is_placed_enough or _was_placed(settings, source)):
         install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
-        return f"{install}{command} --offline locates the frames by structure from motion."
+        return f"{install}{command} --sfm locates the frames by structure from motion."
     if settings.map is not None:
         return f"{command} makes a map of its own{again}."
     if source.calibration.focal_deviation:
@@ -67,4 +67,4 @@ def arguments(settings: RunSettings) -> str:
 def _was_placed(settings: RunSettings, source: Source) -> bool:
     """Whether structure from motion has been tried, or cannot be."""
     tried = settings.fallback and not impossible(settings, source) and has_pycolmap()
-    return settings.offline or settings.map is not None or tried
+    return settings.sfm or settings.map is not None or tried

@@ -46,7 +46,7 @@ def run(
 ) -> Result:
     """Open the sources, calibrate, track and map every frame, write the results.
 
-    With ``settings.offline``, frames are located by structure from motion instead. ``kernels`` is a
+    With ``settings.sfm``, frames are located by structure from motion instead. ``kernels`` is a
     compilation that is running already; the caller stops it.
 
     Raises:
@@ -73,7 +73,7 @@ def run(
         compile_gpu_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
         opened = without_overlay(opened, progress)
-        if settings.offline:
+        if settings.sfm:
             return driver.complete(_offline(settings.config, driver, opened))
         source = self_calibrated(opened, settings.config, device, progress, stop)
         prior = open_prior(settings.config.prior, source.camera, device)
@@ -89,9 +89,9 @@ def _report_settings(settings: RunSettings, defers_map: bool, progress: RunProgr
     """Name settings that do nothing. Raises InputError for those that exclude each other."""
     config = settings.config
     knows_metres = scale_source(settings.scale_from) is not None or config.input.depth != "none"
-    if settings.offline and knows_metres:
-        raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
-    if not settings.offline:
+    if settings.sfm and knows_metres:
+        raise InputError("--sfm knows no metres: leave out --scale-from and --depth.")
+    if not settings.sfm:
         for sentence in idle_settings(config, defers_map, _is_live(settings)):
             progress.write(f"note: {sentence}")
     if (operator := operator_found(config.tracking)) is not None:
@@ -140,7 +140,7 @@ def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
     opened = open_source(settings.source, replace(given, intrinsics=str(known)))
     focal = base.camera.fx
     is_same = math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
-    return opened if is_same or given.field_of_view != "auto" else opened.with_focal(focal)
+    return opened if is_same or given.working_field_of_view != "auto" else opened.with_focal(focal)
 
 
 def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Result:

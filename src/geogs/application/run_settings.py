@@ -5,13 +5,14 @@ This module imports only the settings, so that a command line can be read at onc
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from geogs.application.named_files import with_absolute_paths
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import (
     RARE,
     Basic,
+    Formerly,
     Port,
     Positional,
     Positive,
@@ -46,12 +47,12 @@ class RunSettings(Settings):
     """What is known in metres; the result is then in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of
     an image as it came; several with semicolons), aruco:DICT_5X5_50:0.12 (tags whose side is so
     long), height:1.6 (of the camera over the ground), or sensor (with --depth)."""
-    offline: bool = False
-    """Do not track: place sharp frames by structure from motion (pycolmap) and all others against
-    them; for videos that tracking cannot follow."""
+    sfm: Annotated[bool, Formerly({"--offline": "--sfm", "--no-offline": "--no-sfm"})] = False
+    """Structure from motion instead of tracking: pycolmap locates sharp frames, and all others are
+    located against them; for videos that tracking cannot follow."""
     fallback: Annotated[bool, RARE] = True
     """Look for lost frames about those that were tracked, and where much was lost, or nothing to be
-    relied on, also place all frames as --offline does, and keep what is better (pip install
+    relied on, also place all frames as --sfm does, and keep what is better (pip install
     'geogs[photos]')."""
     online_results: Annotated[bool, RARE] = False
     """Also write trajectory and mesh as they are after the stream, to online/, and after the final
@@ -82,7 +83,7 @@ class ReconstructSettings(Settings):
     """Settings of a reconstruction from known poses."""
 
     source: Annotated[Path, Positional(unless=("print-config",))] = Path()
-    """Folder of images with poses, or the file with the poses; with --poses auto a folder of
+    """Folder of images with poses, or the file with the poses; with --sfm a folder of
     photographs."""
     config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
     """How to compute."""
@@ -90,8 +91,8 @@ class ReconstructSettings(Settings):
     """Folder for the results; without it out/NAME, or out/NAME-2 where that is taken."""
     budget: Annotated[float | None, Range(above=0), Time] = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
-    poses: Literal["given", "auto"] = "given"
-    """given with the images, or auto: found from the photographs alone, by pycolmap."""
+    sfm: Annotated[bool, Formerly({"--poses auto": "--sfm", "--poses given": "--no-sfm"})] = False
+    """Structure from motion of photographs without poses: pycolmap estimates them."""
     check_poses: Annotated[bool, RARE] = True
     """Whether to see by matching images that the poses follow the expected convention."""
     hold_out: Annotated[int | None, Range(2), RARE] = None

@@ -19,7 +19,7 @@ class ReconstructOptions(Verbosity, ConfigOptions, ReconstructSettings):
     """Reconstruct images whose poses are known: a COLMAP model, nerfstudio, DTU, Replica, TUM...
 
     Lengths of the result are in the unit of the poses. Every default works. Photographs without
-    poses: ``geogs reconstruct PHOTOS --poses auto``.
+    poses: ``geogs reconstruct PHOTOS --sfm``.
     """
 
     preset: Preset = "default"

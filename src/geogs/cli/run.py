@@ -57,10 +57,10 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
     if options.print_config:
         return printed(options.config)
     is_live = any(live_address(source) is not None for source in options.source)
-    if options.offline and is_live:
-        raise InputError("--offline reads a video several times; a live source comes but once.")
-    if options.offline and options.map is not None:
-        raise InputError("--map is gone on with by tracking; leave out --offline.")
+    if options.sfm and is_live:
+        raise InputError("--sfm reads a video several times; a live source comes but once.")
+    if options.sfm and options.map is not None:
+        raise InputError("--map is gone on with by tracking; leave out --sfm.")
 
     if options.dry_run:
         from geogs.application.calibrate import without_overlay
@@ -77,8 +77,8 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
     from geogs.application.run import resume, run
 
     settings, stop = record(RunSettings, options), Interruption()
-    if options.offline and options.resume is None and (options.viewer or options.record):
-        raise InputError("--viewer and --record follow tracking, which --offline has none of.")
+    if options.sfm and options.resume is None and (options.viewer or options.record):
+        raise InputError("--viewer and --record follow tracking, which --sfm has none of.")
     go = partial(run, kernels=kernels)
     if options.resume is not None:
         go = partial(resume, options.resume)
@@ -135,8 +135,8 @@ def _defaults(given: Given) -> RunOptions:
     from geogs.application.checkpoints.run_state import SavedRun
 
     folder = Path(given["resume"])
-    for option, name in (("--preset", "preset"), ("--config", "config-file")):
-        if name in given:
+    for option, key in (("--preset", "preset"), ("--config", "config-file")):
+        if key in given:
             raise InputError(f"--resume goes on with the run's settings; leave out {option}.")
     return RunOptions(**vars(SavedRun(folder).settings), resume=folder)
 

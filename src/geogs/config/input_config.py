@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from geogs.config.setting import Basic, NamesFile, Only, Range, Settings
+from geogs.config.setting import Basic, Formerly, NamesFile, Only, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -16,11 +16,19 @@ class InputConfig(Settings, group="input"):
     fisheye,fx,fy,cx,cy[,k1,k2,k3,k4] (OpenCV's, Kannala and Brandt's)."""
     long_edge: Annotated[int, Range(32, 16384, or_zero=True), Basic("--long-edge")] = 512
     """Longer side of the working image in pixels; smaller sources are not enlarged, 0 keeps all."""
-    field_of_view: Annotated[
-        float | Literal["auto"], Range(5, 150), Basic("--field-of-view", is_common=False)
+    working_field_of_view: Annotated[
+        float | Literal["auto"],
+        Range(5, 150),
+        Basic("--working-field-of-view", is_common=False),
+        Formerly(
+            {
+                "--field-of-view": "--working-field-of-view",
+                "--input.field-of-view": "--input.working-field-of-view",
+            }
+        ),
     ] = "auto"
-    """Degrees along the longer side of the working image, a pinhole's; auto keeps all that fits
-    without a border, and of a fisheye at most 90."""
+    """Field of view of the working image, not of the lens: degrees along the longer side, a
+    pinhole's; auto keeps all that fits without a border, and of a fisheye at most 90."""
     readout: Annotated[float | Literal["auto"], Range(-0.1, 0.1), Only("run")] = "auto"
     """Seconds a rolling shutter takes from the first to the last row as the sensor reads them, such
     as 0.0276; 0 for a global shutter, auto finds it in the video."""

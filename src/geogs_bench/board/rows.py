@@ -74,7 +74,7 @@ _WAYS = (
     Row("fast", "handheld-kinect", "run {folder} --preset fast"),
     Row("accurate", "handheld-kinect", "run {folder} --preset accurate"),
     Row("own", "handheld-kinect", "run {folder} --tracking.operator own"),
-    Row("offline", "weak-link", "run {folder} --offline"),
+    Row("offline", "weak-link", "run {folder} --sfm"),
     Row("posed", "slow-stream", "reconstruct {folder}"),
     Row(
         "posed-paper",

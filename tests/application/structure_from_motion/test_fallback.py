@@ -221,7 +221,7 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     plain = ended("plain")
     last = capfd.readouterr().out.splitlines()[-1]
     assert "pip install 'geogs[photos]' && geogs run" in last
-    assert "--offline locates the frames by structure from motion." in last
+    assert "--sfm locates the frames by structure from motion." in last
     monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
     monkeypatch.setattr(PlacedOffline, "place", fails)
     summary = ended()

@@ -52,7 +52,7 @@ def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, ca
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
     c, output = room.camera, tmp_path / "out"
     code = main([
-        "run", str(tmp_path / "video"), "-o", str(output), "--offline", "--device", "cpu",
+        "run", str(tmp_path / "video"), "-o", str(output), "--sfm", "--device", "cpu",
         "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}",
     ])  # fmt: skip
     said = capfd.readouterr().err

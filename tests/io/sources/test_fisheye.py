@@ -130,8 +130,10 @@ def test_fisheye_and_rows_are_undone_at_once(tmp_path):
         image = rolling_image(hand_held, k / RATE, distortion=K, lens="fisheye")
         write_image(tmp_path / f"{k}.png", image)
     intrinsics = "fisheye,150,150,95.5,71.5," + ",".join(map(str, K))
-    both = open_source(tmp_path, InputConfig(intrinsics, field_of_view=60.0, readout=READOUT))
-    lens = open_source(tmp_path, InputConfig(intrinsics, field_of_view=60.0, readout=0.0))
+    both = open_source(
+        tmp_path, InputConfig(intrinsics, working_field_of_view=60.0, readout=READOUT)
+    )
+    lens = open_source(tmp_path, InputConfig(intrinsics, working_field_of_view=60.0, readout=0.0))
     true = global_image(hand_held, 1 / RATE, both.camera).astype(float)
     inner = np.s_[12:-12, 12:-12]
     errors = [np.abs(list(s)[1].image - true)[inner].mean() for s in (both, lens)]

@@ -194,7 +194,9 @@ class CameraNode:
         self._size = (int(message.width), int(message.height))
         config = self._settings.config
         calibration = found.fit(*self._size)
-        self._rectifier = Rectifier(calibration, config.input.long_edge, config.input.field_of_view)
+        self._rectifier = Rectifier(
+            calibration, config.input.long_edge, config.input.working_field_of_view
+        )
         self._slam = Slam(self._rectifier.camera, config, self._settings.device, live=True)
 
     def image(self, message: Any) -> None:

@@ -231,7 +231,7 @@ def impossible(settings: RunSettings, source: Source) -> str:
     if settings.map is not None:
         return "a saved map is gone on with by tracking alone."
     if settings.scale_from or source.uses_depth or source.uses_poses:
-        return "it knows no metres; geogs run --offline without them does it."
+        return "it knows no metres; geogs run --sfm without them does it."
     return ""
 
 

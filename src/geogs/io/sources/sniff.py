@@ -205,7 +205,7 @@ def _posed_set(path: Path) -> PosedSet:
     raise InputError(
         f"{path} holds no images with known poses (COLMAP, nerfstudio, DTU, OpenSfM, Metashape, "
         "OpenMVG, RealityCapture, MVSNet, Kapture, Bundler, or a data set with its true poses); "
-        "use --poses auto for photographs, geogs run for a video."
+        "use --sfm for photographs, geogs run for a video."
     )
 
 

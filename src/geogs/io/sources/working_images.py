@@ -109,7 +109,7 @@ class WorkingImages:
         if masks is not None and self._masks is None:
             valid = read_mask(masks, (info.height, info.width))
         rectify = partial(
-            Rectifier, self.calibration, config.long_edge, config.field_of_view, focal
+            Rectifier, self.calibration, config.long_edge, config.working_field_of_view, focal
         )
         self._rectifier = rectify()
         if valid is not None:

@@ -138,7 +138,7 @@ def test_colmap_fisheye_becomes_a_pinhole_of_the_asked_field_of_view(room, tmp_p
     fx, fy, cx, cy = room.pinhole
     camera = {"model": "OPENCV_FISHEYE", "parameters": (fx, fy, cx, cy, 0.01, 0.0, 0.0, 0.0)}
     project = write_colmap_project(room, tmp_path, **camera)
-    source = open_posed_source(project, replace(NATIVE, field_of_view=30.0))
+    source = open_posed_source(project, replace(NATIVE, working_field_of_view=30.0))
     half = max(source.camera.width, source.camera.height) / 2
     assert math.degrees(2 * math.atan(half / source.camera.fx)) == pytest.approx(30)
     assert source[0].mask is None

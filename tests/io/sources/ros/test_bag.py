@@ -216,7 +216,7 @@ def test_the_lens_of_a_fisheye(tmp_path, kind):
     with BagWriter(tmp_path, kind) as bag:
         bag.camera_info("/camera_info", 0, distortion=k, model="equidistant")
         bag.image("/image", 0, gradient_image(0))
-    calibration = geogs.open_source(bag.path, InputConfig(field_of_view=50.0)).calibration
+    calibration = geogs.open_source(bag.path, InputConfig(working_field_of_view=50.0)).calibration
     assert (calibration.lens, calibration.distortion) == ("fisheye", k)
     (tmp_path / "other").mkdir()
     with BagWriter(tmp_path / "other", kind) as bag:

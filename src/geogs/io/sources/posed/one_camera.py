@@ -44,7 +44,7 @@ class OneCamera:
         }
         self._common = common_place(keys)
         first = cameras[keys[self._common]]
-        rectifier = Rectifier(first, config.long_edge, config.field_of_view)
+        rectifier = Rectifier(first, config.long_edge, config.working_field_of_view)
         self.camera: Camera = rectifier.camera
         """The pinhole camera of every image."""
         self.calibration = first

@@ -1,0 +1,7 @@
+"""``python -m geogs``."""
+
+import sys
+
+from geogs_start import main
+
+sys.exit(main())
