@@ -53,8 +53,9 @@ def test_eval_command_writes_everything(result, capsys, monkeypatch):
     monkeypatch.setattr("geogs.evaluation.pages.shading._WIDTH", 120)
     truth, out = result
     mesh = str(truth / "mesh.ply")
-    assert main([str(out), "--gt", str(truth), "--gt-mesh", mesh, "--samples", "20000"]) == 0
+    assert main([str(out), "--gt", str(truth), "--gt-mesh", mesh, "--samples", "20000"]).code == 0
     printed = capsys.readouterr().out
+    assert "(traj.txt); 60 of 60 frames matched in time." in " ".join(printed.split())
     assert "ATE RMSE, all frames, Sim(3) aligned (cm)" in printed
     numbers = json.loads((out / "eval.json").read_text())
     assert numbers["trajectory"]["ate_rmse_cm"] < 1e-6
@@ -152,7 +153,7 @@ def test_errors_are_laid_beside_what_the_run_said_of_them(result, capfd):
     )
     write_tum_trajectory(out / "trajectory.tum", states.of("tracked"))
     (out / "mesh.ply").unlink()
-    assert main([str(out), "--gt", str(truth)]) == 0
+    assert main([str(out), "--gt", str(truth)]).code == 0
     assert "frames within 2 sigma (%)" in capfd.readouterr().out
     numbers = json.loads((out / "eval.json").read_text())
     told = numbers["reliability"]
@@ -173,7 +174,7 @@ def test_what_speaks_against_a_comparison_is_said_before_anything_else(result, c
     (out / "mesh.ply").unlink()
     good = {"verdict": {"sentence": "All is well.", "is_reliable": True}}
     (out / "summary.json").write_text(json.dumps(good))
-    assert main([str(out), "--gt", str(truth), "--no-plots"]) == 0
+    assert main([str(out), "--gt", str(truth), "--no-plots"]).code == 0
     assert "Only 10 of 60 poses match in time" in capfd.readouterr().err.replace("\n", " ")
     page = (out / "report" / "index.html").read_text()
     assert page.index('verdict bad">Only 10 of 60') < page.index("All is well.")
@@ -258,7 +259,8 @@ def test_dtu_runs_from_the_command(tmp_path):
     write_tum_trajectory(out / "trajectory.tum", poses)
     write_intrinsics(out / "intrinsics.json", CAMERA)
     (out / "summary.json").write_text('{"scale": "of the poses (millimetres)"}')
-    assert main([str(out), "--gt", str(scan), "--protocol", "dtu", "--dtu-data", str(data)]) == 0
+    words = ["--gt", str(scan), "--protocol", "dtu", "--dtu-data", str(data)]
+    assert main([str(out), *words]).code == 0
     numbers = json.loads((out / "eval.json").read_text())
     assert numbers["trajectory"]["ate_max_cm"] < 1e-6
     assert numbers["trajectory"]["path_length_m"] == pytest.approx(0.005 + 0.005 * 2**0.5)

@@ -8,11 +8,17 @@ import pytest
 import torch
 
 from geogs.application.machine import doctor
-from geogs.cli.doctor import main
+from geogs.cli import doctor as command
+from geogs.cli.answer import shown
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+def main(argv: list[str]) -> int:
+    """The command, whose end is printed."""
+    return shown(command.main(argv))
 
 
 @pytest.fixture

@@ -78,6 +78,7 @@ def _evaluated(settings: EvalSettings, new: Path) -> Evaluation:
     by_icp = settings.icp if settings.protocol == "area" else settings.protocol in _ICP_PROTOCOLS
     compared: dict[str, object] = {
         "true_poses": str(settings.gt),
+        "clock_of_true_poses": scene.clock,
         "true_surface": mesh_file and str(mesh_file),
         "seen_points": points_file and str(points_file),
         "protocol": settings.protocol if scores is None else scores.protocol,

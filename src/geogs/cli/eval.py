@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from geogs.application.result_settings import EvalSettings
 from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
-from geogs.terminal_text import printable
+from geogs.terminal_text import printable, say
 
 
 def main(argv: Sequence[str]) -> Answer:
@@ -19,11 +19,16 @@ def main(argv: Sequence[str]) -> Answer:
     from geogs.evaluation.pages.evaluation_page import table
 
     evaluation = evaluate(options)
+    errors = evaluation.trajectory
+    say(
+        f"True poses: {options.gt}, with {evaluation.settings['clock_of_true_poses']}; "
+        f"{errors.pairs} of {errors.estimated} frames matched in time."
+    )
     Console(markup=False).print(table(evaluation))
     for sentence in evaluation.doubts:
         Console(stderr=True).print(
             printable(f"warning: {sentence}"), markup=False, style="bold red", highlight=False
         )
-    errors = read_json(options.output / "eval.json")
-    values = {"folder": options.output, "errors": errors, "warnings": list(evaluation.doubts)}
+    found = read_json(options.output / "eval.json")
+    values = {"folder": options.output, "errors": found, "warnings": list(evaluation.doubts)}
     return Answer("", values)

@@ -26,6 +26,8 @@ class TrueScene:
     path: Path
     trajectory: Trajectory
     """Poses in metres (or the data set's own unit where that is arbitrary)."""
+    clock: str
+    """Where their times are from, in words."""
     metres: float = 1.0
     """Metres per unit of the data set."""
 
@@ -48,7 +50,8 @@ def read_true_scene(path: Path) -> TrueScene:
         InputError: there are no poses.
     """
     try:
-        return TrueScene(path, read_truth(path))
+        trajectory, clock = read_truth(path)
+        return TrueScene(path, trajectory, clock)
     except InputError as error:
         is_model = path.is_file() and path.name in _MODEL
         is_table = path.is_file() and path.suffix in (".txt", ".tum", ".csv", ".traj", ".freiburg")
@@ -63,7 +66,7 @@ def read_true_scene(path: Path) -> TrueScene:
     T_wc = np.linalg.inv(source.T_cw)
     T_wc[:, :3, 3] *= metres
     trajectory = Trajectory(source.timestamps, T_wc, np.ones(len(T_wc), bool))
-    return TrueScene(path, trajectory, metres)
+    return TrueScene(path, trajectory, "the times of its images", metres)
 
 
 def scaled(trajectory: Trajectory, factor: float) -> Trajectory:

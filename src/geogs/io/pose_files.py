@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from geogs.documents import numbered, read_text
+from geogs.documents import first_file, numbered, read_text
 from geogs.errors import InputError
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.types import Trajectory
@@ -134,13 +134,20 @@ def read_seven_scenes_poses(folder: Path) -> Trajectory:
 
 def read_poses(path: Path) -> Trajectory:
     """Read poses in whichever of the formats above ``path`` is: a folder, or rows of 8, 12, 16."""
-    if path.is_dir():
-        for name in POSE_FILES:
-            if (path / name).is_file():
-                return read_poses(path / name)
+    file = pose_file(path)
+    if file is None:
         return read_seven_scenes_poses(path)
-    columns = len(next(_numbers_by_line(path), (0, []))[1])
-    return read_tum_trajectory(path) if columns == 8 else read_replica_trajectory(path)
+    return read_tum_trajectory(file) if columns_of(file) == 8 else read_replica_trajectory(file)
+
+
+def pose_file(path: Path) -> Path | None:
+    """The file with the poses: the path, or that in a folder; none in one of 7-Scenes."""
+    return first_file(path / name for name in POSE_FILES) if path.is_dir() else path
+
+
+def columns_of(path: Path) -> int:
+    """How many numbers the first row of a file has; 0 where there is none."""
+    return len(next(_numbers_by_line(path), (0, []))[1])
 
 
 def _read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from geogs.documents import UNUSABLE, first_file, numbered
 from geogs.errors import InputError
-from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
+from geogs.io.pose_files import columns_of, is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_camera, kitti_offset
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, Place, images_in
@@ -22,6 +22,8 @@ from geogs.types import Trajectory
 ODOMETRY = ("image_2", "image_0", "image_3", "image_1")
 """Folders of images, those of the left colour camera first."""
 _NAME = re.compile(r"([0-9]{1,12})\.\w+")
+_MATRIX = (12, 16)
+"""Numbers of a matrix in a row, without and with its last row."""
 _FRAMES_PER_SECOND = 10.0
 """Rate of the data set, where the file of times is missing."""
 
@@ -58,8 +60,8 @@ def open_posed_kitti_odometry(place: Place) -> PosedSet:
 
 
 def is_kitti_truth(path: Path) -> bool:
-    """Whether ``path`` has poses of the odometry benchmark, and the sequence of that name has the
-    times of its images."""
+    """Whether ``path`` has a matrix a row, and the sequence of that name, or its own folder, has
+    the times of the images."""
     return path.suffix == ".txt" and _sequence_of(path) is not None
 
 
@@ -73,12 +75,15 @@ def read_kitti_truth(path: Path) -> Trajectory:
 def _sequence_of(path: Path) -> Path | None:
     path = path.absolute()
     above = (path.parent, path.parent / "sequences", path.parent.parent / "sequences")
-    places = (folder / path.stem for folder in (*above, path.parent.parent))
-    return next((place for place in places if (place / "times.txt").is_file()), None)
+    named = [folder / path.stem for folder in (*above, path.parent.parent)]
+    places = [place for place in (*named, path.parent) if (place / "times.txt").is_file()]
+    if not places or (places[0] == path.parent and columns_of(path) not in _MATRIX):
+        return None
+    return places[0]
 
 
 def _poses(file: Path, folder: Path) -> Trajectory:
-    rows = read_rows(file, (12,), "the upper 3x4 of a matrix a row")
+    rows = read_rows(file, _MATRIX, "the upper 3x4 of a matrix a row")
     times = folder / "times.txt"
     seconds = _seconds(times) if times.is_file() else np.arange(len(rows)) / _FRAMES_PER_SECOND
     if len(rows) > len(seconds):
@@ -87,7 +92,7 @@ def _poses(file: Path, folder: Path) -> Trajectory:
             "one sequence?"
         )
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3] = rows.reshape(-1, 3, 4)
+    T_wc[:, :3] = rows[:, :12].reshape(-1, 3, 4)
     return matrix_trajectory(file, seconds[: len(rows)], T_wc, is_rigid(T_wc))
 
 
