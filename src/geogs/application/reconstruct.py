@@ -19,6 +19,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.output_cost import OutputForecast
+from geogs.application.plan import POSED_STAGES
 from geogs.application.posed_views import PosedViews
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import chosen_folder, claimed
@@ -157,6 +158,7 @@ def reconstruct_to_folder(
         for line in source.account.lines(source.found):
             progress.write(line)
         warn_of_border(source, progress)
+        progress.stages(POSED_STAGES)
         begin += _compiled(device, kernels, settings.budget, progress)
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)

@@ -12,6 +12,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
+from geogs.application.plan import run_stages
 from geogs.application.prior_choice import open_prior
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
@@ -64,6 +65,7 @@ def run(
     base = None if settings.map is None else load_result(settings.map, device)
     opened = opened_for(settings, base)
     _check_input(settings, opened, progress)
+    progress.stages(run_stages(settings, opened))
     wanted = settings.output or Path("out") / opened.stem
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")

@@ -9,7 +9,7 @@ from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.answer import Answer
 from geogs.cli.config_options import ConfigOptions, printed, with_settings_file
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.terminal.speech import followed, say_input, say_loading
+from geogs.cli.terminal.speech import dry_answer, followed, say_loading
 from geogs.config import Preset, reconstruct_preset
 from geogs.gpu.early_start import is_gpu, start_gpu
 
@@ -26,7 +26,7 @@ class ReconstructOptions(Verbosity, ConfigOptions, ReconstructSettings):
     """Group of settings: those of --config and single ones win. Without it, accurate on a GPU and
     default on a CPU."""
     dry_run: bool = False
-    """Only say what the input holds and how it is read; with --poses given."""
+    """Only say what the input holds and would be done; not with --sfm."""
 
 
 def main(argv: Sequence[str]) -> Answer | int:
@@ -36,12 +36,19 @@ def main(argv: Sequence[str]) -> Answer | int:
     if options.print_config:
         return printed(options.config)
     if options.dry_run:
+        from geogs.application.plan import POSED_STAGES, plan_for
+        from geogs.application.results.output_folder import chosen_folder
         from geogs.io.sources.posed.pose_check import with_focal_length
+        from geogs.io.sources.reader import without_ending
         from geogs.io.sources.sniff import open_posed_source
 
         source = open_posed_source(options.source, options.config.input, options.hold_out)
-        say_input(with_focal_length(source))
-        return 0
+        source = with_focal_length(source)
+        name = without_ending(source.name, [options.source])
+        output = chosen_folder(options.output, name, options.overwrite or options.resume)
+        device = "cuda" if is_gpu(options.device) else "cpu"
+        plan = plan_for(POSED_STAGES, output, len(source), source.camera, device)
+        return dry_answer(source, plan)
     say_loading(options)
     start_gpu(options.device)
     settings = record(ReconstructSettings, options)

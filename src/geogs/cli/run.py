@@ -18,7 +18,7 @@ from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.answer import Answer
 from geogs.cli.config_options import ConfigOptions, printed, with_settings_file
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.terminal.speech import followed, say_input, say_loading
+from geogs.cli.terminal.speech import dry_answer, followed, say_loading
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
@@ -64,13 +64,18 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
 
     if options.dry_run:
         from geogs.application.calibrate import without_overlay
+        from geogs.application.plan import plan_for, run_stages
         from geogs.application.progress.terminal_progress import TerminalProgress
+        from geogs.application.results.output_folder import chosen_folder
         from geogs.io.sources.sniff import open_source
 
         opened = open_source(options.source, options.config.input)
-        say_input(opened)
-        without_overlay(opened, TerminalProgress(options))
-        return 0
+        opened = without_overlay(opened, TerminalProgress(options))
+        stages = run_stages(record(RunSettings, options), opened)
+        frames = None if opened.is_live else opened.length
+        output = chosen_folder(options.output, opened.stem, options.overwrite)
+        device = "cuda" if is_gpu(options.device) else "cpu"
+        return dry_answer(opened, plan_for(stages, output, frames, opened.camera, device))
     say_loading(options)
     start_gpu(options.device)
     from geogs.application.interrupt import Interruption

@@ -113,3 +113,31 @@ def test_a_terminal_shows_one_line_with_the_time_left(monkeypatch):
         assert re.search(r"about 1 min 1\d s left", line)
     words = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())
     assert os.linesep * 2 not in words
+
+
+@pytest.mark.parametrize(
+    ("phase", "number", "later"),
+    [("calibration", "1/3", "then frames, mesh"), ("mesh", "3/3", ""), ("compiling", "", "")],
+)
+def test_the_stages_to_come_are_named_from_the_start(monkeypatch, phase, number, later):
+    shown = io.StringIO()
+    monkeypatch.setattr(
+        terminal_progress,
+        "Console",
+        lambda **_: Console(file=shown, force_terminal=True, width=140, highlight=False),
+    )
+    with TerminalProgress() as progress:
+        progress.stages(("calibration", "frames", "mesh"))
+        progress.stage(phase, 0.25)
+        progress._bar.refresh()
+        line = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue().split("\r")[-1])
+    assert line.strip().startswith(" ".join(filter(None, (number, phase))))
+    assert ("then" in line) is bool(later)
+    assert later in " ".join(line.split())
+
+
+def test_without_a_terminal_the_stages_are_a_line(capsys):
+    with TerminalProgress() as progress:
+        progress.stages(("frames", "mesh"))
+        progress.stages(())
+    assert capsys.readouterr().err == "Stages: frames, mesh.\n"

@@ -1,5 +1,6 @@
 """Interface for progress reports of a run."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,6 +12,9 @@ class RunProgress:
 
     def write(self, text: str) -> None:
         """Show a sentence to the user; nothing if it is empty."""
+
+    def stages(self, names: Sequence[str]) -> None:
+        """Called at the start with the names of the stages to come, where they are known."""
 
     def expect(self, frames: int | None) -> None:
         """Called before the first frame, with the number of frames if known."""

@@ -3,6 +3,7 @@
 import logging
 import math
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -42,17 +43,21 @@ class TerminalProgress(RunProgress):
             TextColumn("{task.fields[percent]:>4}"),
             TextColumn("{task.fields[info]}"),
             TextColumn("{task.fields[left]}", style="cyan"),
+            TextColumn("{task.fields[then]}", style="dim"),
             console=Console(stderr=True, quiet=self._verbosity.quiet, highlight=False),
             refresh_per_second=_REDRAWS,
             # Window for the pace of a stage, in seconds: first parts often differ.
             speed_estimate_period=60.0,
             transient=True,
         )
-        self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
+        self._task = self._bar.add_task(
+            "", total=1.0, percent="", info="", left="", then="", start=False
+        )
         self._frames: int | None = None
         self._dropped = 0
         self._printed = self._phase_began = time.perf_counter()
         self._phase = self._stage = self._last = ""
+        self._stages: tuple[str, ...] = ()
         self._memory = ""
         self._measured = -math.inf
         self._log: logging.Handler | None = None
@@ -93,6 +98,12 @@ class TerminalProgress(RunProgress):
             if self._verbosity.quiet:
                 _print(Console(stderr=True, highlight=False), text)
         _print(self._bar.console, text)
+
+    def stages(self, names: Sequence[str]) -> None:
+        """Name all stages where there is no terminal; in its line the present one has a number."""
+        self._stages = tuple(names)
+        if names and not self._bar.console.is_terminal:
+            self.write(f"Stages: {', '.join(names)}.")
 
     def expect(self, frames: int | None) -> None:
         """Begin with the frames."""
@@ -169,9 +180,16 @@ class TerminalProgress(RunProgress):
         self._last = f", {info}" if info else ""
         self._bar.update(self._task, completed=done or 0.0)
         left = self._bar.tasks[0].time_remaining
-        ahead = "" if left is None else f"about {duration(left)} left"
+        ahead = "" if left is None else f"about {duration(left)} left of this stage"
+        number, to_come = self._position()
+        shown = " ".join(filter(None, (number, what)))
         self._bar.update(
-            self._task, description=f"{what:<20}", percent=percent, info=info, left=ahead
+            self._task,
+            description=f"{shown:<20}",
+            percent=percent,
+            info=info,
+            left=ahead,
+            then=to_come,
         )
         if self._bar.console.is_terminal and not self._bar.live.is_started:
             self._bar.start()
@@ -183,6 +201,14 @@ class TerminalProgress(RunProgress):
         self.note(text)
         if not self._bar.console.is_terminal:
             _print(self._bar.console, text)
+
+    def _position(self) -> tuple[str, str]:
+        """Number of the present stage among all, and the names of those to come, in words."""
+        if self._phase not in self._stages:
+            return "", ""
+        place = self._stages.index(self._phase)
+        later = self._stages[place + 1 :]
+        return f"{place + 1}/{len(self._stages)}", f"then {', '.join(later)}" if later else ""
 
     def note(self, text: str) -> None:
         """Write a line to the log only, if there is one."""

@@ -4,6 +4,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from geogs.application.run_settings import RunSettings, Verbosity
@@ -13,6 +14,7 @@ from geogs.terminal_text import printable, say
 
 if TYPE_CHECKING:
     from geogs.application.interrupt import Stop
+    from geogs.application.plan import Plan
     from geogs.application.progress.run_progress import RunProgress
     from geogs.application.results.result import Result
     from geogs.io.sources.frame_source import Source
@@ -31,9 +33,11 @@ def say_loading(options: Verbosity) -> None:
         print("loading ...", end="\r", file=sys.stderr, flush=True)
 
 
-def say_input(source: "Source | PosedSource") -> None:
-    """Print what an input holds and how it is read, for ``--dry-run``."""
-    say(*source.account.lines(source.found))
+def dry_answer(source: "Source | PosedSource", plan: "Plan") -> Answer:
+    """What an input holds, how it is read and what would be done, for ``--dry-run``."""
+    lines = [*source.account.lines(source.found), *plan.lines()]
+    found = {"found": source.found, **asdict(source.account)}
+    return Answer("\n".join(map(printable, lines)), {"input": found, "plan": asdict(plan)})
 
 
 def followed(
