@@ -289,7 +289,7 @@ def test_a_gpu_that_is_full_in_the_final_stages_keeps_the_online_result(
     assert run_small(small_room, tmp_path) == 2
     said = capsys.readouterr().err
     assert "no memory left for the final stages" in said
-    assert "goes on from the last checkpoint" in said  # the frames need not be tracked again
+    assert "continues from the last checkpoint" in said  # the frames need not be tracked again
     assert len(read_tum_trajectory(tmp_path / "trajectory.tum").timestamps) == SMALL_FRAMES
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
 

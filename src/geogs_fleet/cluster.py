@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from geogs.errors import InputError
+from geogs.extras import install_command
 from geogs.version import __version__
 from geogs_fleet.fleet_options import FleetOptions
 
@@ -48,7 +49,7 @@ def ray_cluster(address: str) -> Iterator[Any]:
     try:
         import ray
     except ImportError:
-        raise InputError("geogs fleet needs Ray: pip install 'geogs[fleet]'.") from None
+        raise InputError(f"geogs fleet needs Ray: {install_command('fleet')}") from None
     if ray.is_initialized():
         yield ray
         return
@@ -143,7 +144,7 @@ def _connect(ray: Any, address: str) -> None:
     if tuple(int(part) for part in ray.__version__.split(".")[:2]) < ASKS_FOR_TOKEN:
         raise InputError(
             f"Ray {ray.__version__} would start a cluster that anybody on the network can use; "
-            "pip install -U 'geogs[fleet]'."
+            f"{install_command('fleet')} --upgrade"
         )
     ray.init(
         address="local",

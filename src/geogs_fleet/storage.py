@@ -7,6 +7,7 @@ from typing import Any
 
 from geogs.documents import expanded, read_text
 from geogs.errors import GeogsError, InputError, OutputError
+from geogs.extras import install_command
 from geogs.io.writers.atomic import write_text
 
 PATIENCE = 60.0
@@ -143,7 +144,8 @@ class StoragePath:
         try:
             from fsspec.core import url_to_fs
         except ImportError:
-            raise InputError(f"{self.address} needs fsspec: pip install 'geogs[fleet]'.") from None
+            command = install_command("fleet")
+            raise InputError(f"{self.address} needs fsspec: {command}") from None
         try:
             reached = url_to_fs(self.address, **_limits(self.address))
         except (ImportError, ValueError) as error:

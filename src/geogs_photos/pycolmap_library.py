@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from geogs.errors import InputError
+from geogs.extras import install_command
 
 
 def load_colmap() -> Any:
@@ -22,8 +23,7 @@ def load_colmap() -> Any:
             import pycolmap
     except ImportError as error:
         raise InputError(
-            "Finding the poses of photographs needs pycolmap; pip install 'geogs[photos]' brings "
-            f"it ({error})."
+            f"Structure from motion needs pycolmap ({error}): {install_command('photos')}"
         ) from error
     # Failures are raised as exceptions; its lines would disturb the progress line.
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)

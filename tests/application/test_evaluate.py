@@ -163,7 +163,7 @@ def test_errors_are_laid_beside_what_the_run_said_of_them(result, capfd):
     assert np.abs(np.subtract(told["observed"], told["foretold"])).max() < 0.2
     assert numbers["trajectory"]["rotations"] == "absolute"
     assert numbers["doubts"] == []
-    assert "Are errors as large as foretold?" in (out / "report" / "index.html").read_text()
+    assert "Are errors as large as predicted?" in (out / "report" / "index.html").read_text()
 
 
 def test_what_speaks_against_a_comparison_is_said_before_anything_else(result, capfd):

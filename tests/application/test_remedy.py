@@ -13,6 +13,7 @@ from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.cli.run import parse
 from geogs.config import Config, InputConfig, preset
+from geogs.extras import install_command
 from geogs.geometry.camera import Camera
 from geogs.io.sources.frame_source import Source
 
@@ -44,7 +45,8 @@ def test_a_good_result_needs_none(photos):
 def test_where_structure_from_motion_was_not_tried_it_is_named(photos):
     photos(False)
     said = remedy(VIDEO, source(), LOST, 90.0)
-    assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --sfm ")
+    install = install_command("photos")
+    assert said.startswith(f"{install} && geogs run 'my video.mp4' --sfm ")
     photos(True)
     said = remedy(replace(VIDEO, fallback=False), source(), LOST, 90.0)
     assert said.startswith("geogs run 'my video.mp4' --sfm locates")

@@ -70,7 +70,7 @@ def test_what_is_not_believed_leaves_the_shutter_global(folder, monkeypatch):
     assert not source.is_shutter_open
     finding(monkeypatch, FoundReadout())
     source = self_calibrated(open_source(folder, InputConfig(INTRINSICS)))
-    assert source.shutter.origin == "the video does not tell"
+    assert source.shutter.origin == "could not be estimated from the video"
 
 
 def test_what_is_given_is_not_looked_for(folder, monkeypatch):

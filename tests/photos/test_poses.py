@@ -1,6 +1,7 @@
 """Poses of rendered photographs against the truth; what is left out, and why."""
 
 import json
+import re
 import sys
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 from geogs.cli.main import main
 from geogs.errors import InputError
+from geogs.extras import install_command
 from geogs.geometry.umeyama import umeyama
 from geogs.io.sources.formats.colmap import open_colmap
 from geogs_photos.photo_features import PhotoFeatures, find_features
@@ -114,7 +116,7 @@ def test_reasons_say_what_was_missing():
 
 def test_without_pycolmap_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(InputError, match=r"pip install 'geogs\[photos\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("photos"))):
         load_colmap()
 
 

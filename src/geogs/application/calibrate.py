@@ -190,7 +190,7 @@ def refined(
             failure=found.failure,
             is_explained=found.failure != Degeneracy.UNEXPLAINED.value,
         )
-        origin = f"{calibration.origin}; the video does not tell: {found.failure}"
+        origin = f"{calibration.origin}; not estimated from the video: {found.failure}"
         return replace(calibration, origin=origin, refinement=said)
     factor = found.camera.fx / working_focal
     focal = calibration.fx * factor
@@ -255,7 +255,7 @@ def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> 
 def _shutter(found: FoundReadout) -> Shutter:
     """The estimated shutter; global where the estimate is not accepted."""
     if not math.isfinite(found.error):
-        return Shutter(origin="the video does not tell", error=found.left_open)
+        return Shutter(origin="could not be estimated from the video", error=found.left_open)
     return Shutter(found.readout, f"the video says {_evidence(found)}", found.left_open)
 
 

@@ -176,7 +176,7 @@ def _draw(
         titles["trajectory_error.png"] = "Error over time"
     if evaluation.reliability is not None:
         plots.plot_reliability(folder / "reliability.png", evaluation.reliability)
-        titles["reliability.png"] = "Are errors as large as foretold?"
+        titles["reliability.png"] = "Are errors as large as predicted?"
     if surface is not None:
         camera = read_camera(settings.output / "intrinsics.json")
         views = viewpoints(surface.mesh.vertices, trajectory.aligned, camera)

@@ -201,7 +201,7 @@ class MappedImages(Work):
 
     scene: Reconstruction
     source: PosedSource
-    way_on = "The same command with --resume goes on from the last checkpoint."
+    way_on = "The same command with --resume continues from the last checkpoint."
 
     def __init__(
         self, scene: Reconstruction, source: PosedSource, settings: ReconstructSettings

@@ -8,6 +8,7 @@ from geogs.application.structure_from_motion.fallback import impossible, is_want
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.config import InputConfig, preset_of
 from geogs.evaluation.duration import duration
+from geogs.extras import install_command
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
 
@@ -39,7 +40,7 @@ def remedy(
     command = f"geogs run {arguments(settings)}"
     again = f", in about {duration(took)}" if took else ""
     if not (is_placed_enough or _was_placed(settings, source)):
-        install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
+        install = "" if has_pycolmap() else f"{install_command('photos')} && "
         return f"{install}{command} --sfm locates the frames by structure from motion."
     if settings.map is not None:
         return f"{command} makes a map of its own{again}."

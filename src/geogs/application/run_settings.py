@@ -29,8 +29,8 @@ class RunSettings(Settings):
     """Settings of a run: what it reads, how it computes, what it writes."""
 
     source: Annotated[tuple[Path, ...], Positional(unless=("resume", "print-config"))] = ()
-    """Video, folder or data set; several of one place, by one camera, make one map. Or what does
-    not wait: camera:0, rtsp://HOST/PATH, - (raw frames from a pipe), play:FILE (a file at its
+    """Video, folder or data set; several of one place, by one camera, make one map. Or a live
+    source: camera:0, rtsp://HOST/PATH, - (raw frames from a pipe), play:FILE (a file at its
     pace)."""
     config: Annotated[Config, Unnamed] = field(default_factory=Config)
     """How to compute."""
@@ -51,9 +51,8 @@ class RunSettings(Settings):
     """Structure from motion instead of tracking: pycolmap locates sharp frames, and all others are
     located against them; for videos that tracking cannot follow."""
     fallback: Annotated[bool, RARE] = True
-    """Look for lost frames about those that were tracked, and where much was lost, or nothing to be
-    relied on, also place all frames as --sfm does, and keep what is better (pip install
-    'geogs[photos]')."""
+    """Locate lost frames by structure from motion; if many are lost, or the result is not reliable,
+    try --sfm and keep the better result (needs geogs[photos])."""
     online_results: Annotated[bool, RARE] = False
     """Also write trajectory and mesh as they are after the stream, to online/, and after the final
     bundle adjustment and the map's update, to adjusted/, where a refinement follows; all appear

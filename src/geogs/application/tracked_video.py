@@ -41,7 +41,7 @@ class TrackedVideo:
     def way_on(self) -> str:
         """The command that resumes from the last checkpoint."""
         on_cpu = ", with --device cpu on the CPU" if self.metadata.device != "cpu" else ""
-        return f"geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
+        return f"geogs run --resume {self.output} continues from the last checkpoint{on_cpu}."
 
     def state(self) -> RunState | None:
         """The checkpoint record; none where the run cannot be resumed."""

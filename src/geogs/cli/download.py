@@ -17,7 +17,7 @@ from geogs.terminal_text import printable
 class DownloadOptions(Verbosity):
     """Fetch a public sequence with its true poses; without a name, list those that are known.
 
-    What was cut off is gone on with by the same command. The licence is that of the data set's
+    The same command continues an interrupted download. The licence is that of the data set's
     makers, who also say what to cite.
     """
 

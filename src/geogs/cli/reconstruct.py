@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> Answer | int:
         options,
         lambda progress: reconstruct_to_folder(settings, progress, stop),
         stop,
-        "The same command with --resume goes on from here.",
+        "The same command with --resume continues from here.",
     )
 
 

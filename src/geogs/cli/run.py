@@ -60,7 +60,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
     if options.sfm and is_live:
         raise InputError("--sfm reads a video several times; a live source comes but once.")
     if options.sfm and options.map is not None:
-        raise InputError("--map is gone on with by tracking; leave out --sfm.")
+        raise InputError("--map needs tracking; leave out --sfm.")
 
     if options.dry_run:
         from geogs.application.calibrate import without_overlay
@@ -94,7 +94,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
             options,
             lambda progress: go(settings, progress, stop, observer),
             stop,
-            "geogs run --resume {folder} goes on from here.",
+            "geogs run --resume {folder} continues from here.",
             options.strict,
         )
 

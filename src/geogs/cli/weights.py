@@ -24,8 +24,8 @@ from geogs.terminal_text import say
 class WeightsOptions:
     """List the weights files that can be used and where they are had, or verify one.
 
-    Nothing is downloaded. Files are looked for in $GEOGS_WEIGHTS (a file or a folder), in
-    weights/ of the cache directory ($GEOGS_CACHE, else ~/.cache/geogs), and in the package.
+    Nothing is downloaded. It searches $GEOGS_WEIGHTS (a file or a folder),
+    weights/ of the cache directory ($GEOGS_CACHE, else ~/.cache/geogs), and the package.
     """
 
     action: Annotated[Literal["list", "verify"], Positional(required=False)] = "list"
@@ -64,7 +64,7 @@ def listing() -> str:
             f"      licence  {known.licence}",
         ]
 
-    lines = ["looked for in " + ", ".join(map(str, weights_folders()))]
+    lines = ["searched: " + ", ".join(map(str, weights_folders()))]
     titles = {
         "own": "--tracking.operator own",
         "droid": "--tracking.operator droid",

@@ -88,7 +88,7 @@ def _run(config: Config) -> Iterator[str]:
             "mapping.when after does nothing: without a final training the map is made on the way."
         )
     if config.loop.matches and not config.loop.enabled:
-        yield "loop.matches does nothing: no loops are looked for."
+        yield "loop.matches does nothing: loop closing is off."
 
 
 def _mapping(mapping: MappingConfig) -> Iterator[str]:

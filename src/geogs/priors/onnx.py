@@ -15,12 +15,12 @@ from jaxtyping import Float, UInt8
 
 from geogs.documents import in_short, require_file
 from geogs.errors import InputError
+from geogs.extras import install_command
 from geogs.geometry.camera import Camera
 from geogs.priors.card import PriorCard
 from geogs.priors.monocular_prior import DepthKind, PriorMaps
 from geogs.threads import worker_count
 
-MISSING = "Monocular networks in ONNX files need onnxruntime: pip install 'geogs[priors]'."
 _INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "area": cv2.INTER_AREA}
 
 
@@ -191,7 +191,8 @@ def _open(model: Path, device: torch.device) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
-        raise InputError(MISSING) from error
+        command = install_command("priors")
+        raise InputError(f"Networks in ONNX files need onnxruntime: {command}") from error
     if not model.is_file():
         raise InputError(f"There is no file {model} with a monocular network.")
     options = onnxruntime.SessionOptions()

@@ -11,6 +11,7 @@ import torch
 from geogs.application.run_settings import ReconstructSettings
 from geogs.config import MeshConfig
 from geogs.errors import DeviceError, InputError
+from geogs.extras import install_command
 from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
@@ -35,9 +36,7 @@ def require_packages() -> None:
     """Raise InputError if the packages that train the baseline are not installed."""
     for needed in ("gsplat", "pycolmap"):
         if importlib.util.find_spec(needed) is None:
-            raise InputError(
-                f"the baseline with colour needs {needed}: pip install 'geogs[bench]'."
-            )
+            raise InputError(f"the baseline with colour needs {needed}: {install_command('bench')}")
 
 
 def train_baseline(settings: ReconstructSettings) -> None:

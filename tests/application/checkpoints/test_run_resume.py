@@ -109,7 +109,7 @@ def test_a_killed_run_goes_on_even_after_another_interruption(
     shutil.copytree(killed, out)
     said = stop(["run", "--resume", str(out), *OFTEN], signal.SIGINT, checkpoints=2)
     assert "Continuing after" in said
-    assert f"geogs run --resume {out} goes on from here." in said
+    assert f"geogs run --resume {out} continues from here." in said
     summary = json.loads((out / "summary.json").read_text())
     assert summary["interrupted"] is True
     assert summary["frames"] < FRAMES
@@ -163,7 +163,7 @@ def test_a_run_whose_gpu_fails_and_is_full_goes_on_each_time(
     monkeypatch.setattr(Slam, "process", failing)
     assert cli.main(["run", str(own_room), "-o", str(out), *QUICK, *OFTEN]) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
-    way = f"geogs run --resume {out} goes on from the last checkpoint."
+    way = f"geogs run --resume {out} continues from the last checkpoint."
     assert said == f"error: The GPU failed (CUDA error: unspecified launch failure). {way}"
     assert not (out / "summary.json").exists()
     assert cli.main(["run", "--resume", str(out), *OFTEN, "--device", "cpu"]) == 2

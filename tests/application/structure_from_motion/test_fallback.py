@@ -36,6 +36,7 @@ from geogs.cli.main import main
 from geogs.cli.options import record
 from geogs.cli.run import parse
 from geogs.config import Config, preset, preset_of
+from geogs.extras import install_command
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
@@ -220,7 +221,7 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     monkeypatch.setattr(remedy, "is_wanted", lambda _: True)
     plain = ended("plain")
     last = capfd.readouterr().out.splitlines()[-1]
-    assert "pip install 'geogs[photos]' && geogs run" in last
+    assert f"{install_command('photos')} && geogs run" in last
     assert "--sfm locates the frames by structure from motion." in last
     monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
     monkeypatch.setattr(PlacedOffline, "place", fails)

@@ -1,5 +1,6 @@
 """A recording of a run is written, and holds what it should."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from box_room import box, circle
 from geogs.application.viewer.recording import Recorder
 from geogs.errors import InputError, OutputError
+from geogs.extras import install_command
 from geogs.geometry.camera import Camera
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.pose_estimate import PoseEstimate
@@ -68,5 +70,5 @@ def test_a_file_that_cannot_be_written_and_a_missing_library_are_sentences(tmp_p
     with pytest.raises(OutputError, match="cannot be written"):
         Recorder(tmp_path)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"pip install 'geogs\[record\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("record"))):
         Recorder(tmp_path / "a.rrd")

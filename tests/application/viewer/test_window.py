@@ -1,10 +1,13 @@
 """The window on a saved result, in a real browser where there is one."""
 
+import re
+
 import numpy as np
 import pytest
 
 from browser import open_tab
 from geogs.application.results.saved_result import load_result
+from geogs.extras import install_command
 from saved_results import IDS, make_result
 
 
@@ -38,5 +41,5 @@ def test_without_viser_it_is_a_sentence(tmp_path, monkeypatch):
     from geogs.errors import InputError
 
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r"pip install 'geogs\[viewer\]'"):
+    with pytest.raises(InputError, match=re.escape(install_command("viewer"))):
         open_window(load_result(make_result(tmp_path)), "127.0.0.1", 8398)

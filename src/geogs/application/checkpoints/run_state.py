@@ -66,7 +66,7 @@ class SavedRun:
     def _trusted(self, output: Path) -> RunSettings:
         begun = self.metadata.settings
         if any(map(live_address, begun.source)):  # such runs write no checkpoint
-            raise InputError("it names a live source, which cannot be gone on with")
+            raise InputError("it names a live source, which cannot be continued")
         return begun if self._saved.is_own else without_files_outside(begun, output)
 
     @contextmanager

@@ -229,7 +229,7 @@ def impossible(settings: RunSettings, source: Source) -> str:
     if source.is_live:
         return "a live source comes but once; geogs run on its recording would."
     if settings.map is not None:
-        return "a saved map is gone on with by tracking alone."
+        return "a saved map needs tracking."
     if settings.scale_from or source.uses_depth or source.uses_poses:
         return "it knows no metres; geogs run --sfm without them does it."
     return ""

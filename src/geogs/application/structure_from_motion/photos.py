@@ -15,6 +15,7 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
+from geogs.extras import install_command
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.posed.posed_source import PosedSource
@@ -201,6 +202,6 @@ def _registered(name: str) -> Any:
     for point in entry_points(group=GROUP, name=name):
         return point.load()
     raise InputError(
-        "Poses of photographs and points of their features need geogs_photos; "
-        "pip install 'geogs[photos]' brings it."
+        "Poses of photographs and points of their features need geogs_photos: "
+        f"{install_command('photos')}"
     )

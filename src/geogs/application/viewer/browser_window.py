@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt8
 from geogs.errors import InputError
 from geogs.evaluation.model_view.start_view import FIELD, StartView
 from geogs.evaluation.pages.run_pictures import LAYERS, Layer
+from geogs.extras import install_command
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.io.writers.exports.mesh_writers import ONE_SIDED, glb
@@ -42,7 +43,7 @@ class GuardedServer:
         try:
             import viser
         except ImportError:
-            raise InputError("The viewer needs viser: pip install 'geogs[viewer]'.") from None
+            raise InputError(f"The viewer needs viser: {install_command('viewer')}") from None
         self._token = secrets.token_urlsafe(16)
         self._is_guarded = False
         with redirect_stdout(StringIO()), self._guarded():  # it prints a box with the address

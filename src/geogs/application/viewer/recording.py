@@ -8,6 +8,7 @@ import numpy as np
 from geogs.application.viewer.live_viewer import thinned
 from geogs.application.viewer.observer import RunObserver
 from geogs.errors import InputError, OutputError
+from geogs.extras import install_command
 from geogs.types import Frame
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Recorder(RunObserver):
         try:
             import rerun
         except ImportError:
-            raise InputError("Recordings need rerun: pip install 'geogs[record]'.") from None
+            raise InputError(f"Recordings need rerun: {install_command('record')}") from None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.open("wb").close()

@@ -76,7 +76,7 @@ def followed(
 
             took = result.scene.stopwatch.total
             said = remedy(options, result.source, result.verdict, took)
-            words += [f"What may help: {said}"] if said else []
+            words += [f"Suggestion: {said}"] if said else []
         words += [way_on.format(folder=printable(result.folder))] if result.can_resume else []
         for line in words:
             progress.note(line)

@@ -151,7 +151,7 @@ class Calibration:
         camera, distortion = with_bend(
             self.camera(), self.distortion, self.lens, bend, found.focal, shift
         )
-        origin = f"{self.origin}; bent as all matches say, by k1 {found.k1:.4f}, k2 {found.k2:.4f}"
+        origin = f"{self.origin}; distortion refined: k1 {found.k1:.4f}, k2 {found.k2:.4f}"
         if found.is_off_centre:
             off = camera.cx - self.cx, camera.cy - self.cy
             origin = f"{origin}, principal point moved by {off[0]:.1f}, {off[1]:.1f} pixels"

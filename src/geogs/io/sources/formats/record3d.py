@@ -20,6 +20,7 @@ from jaxtyping import Float32
 
 from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes, require_file
 from geogs.errors import InputError
+from geogs.extras import install_command
 from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL, poses_from
 from geogs.io.sources.calibration import Calibration
@@ -148,7 +149,7 @@ class Record3dRecording:
         fault = ""
         if depths and _lzfse() is None:
             depths = 0
-            fault = "Record3D's depth needs pip install 'geogs[record3d]'"
+            fault = f"Record3D's depth needs liblzfse: {install_command('record3d')}"
         self.info = RecordingInfo(
             "record3d",
             path.resolve().stem,

@@ -18,6 +18,7 @@ from geogs.documents import (
     yaml_value,
 )
 from geogs.errors import GeogsError, InputError
+from geogs.extras import install_command
 from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.reader import RawFrame, RecordingInfo, median_rate
@@ -134,7 +135,7 @@ def _opened(path: Path) -> Iterator[Any]:
         from geogs.io.sources.ros.database import Recording
     except ImportError as error:
         raise InputError(
-            f"{path} is a recording of ROS; pip install 'geogs[ros]' brings what reads it."
+            f"{path} is a recording of ROS, which needs rosbags: {install_command('ros')}"
         ) from error
     _require_files(path)
     try:
@@ -184,7 +185,7 @@ def _chosen(bag: Any, path: Path, asked: str) -> tuple[str, Account]:
     topics = {t: info.msgcount for t, info in bag.topics.items() if _has_images(bag, t)}
     listed = ", ".join(sorted(topics)) or "none"
     if asked != "auto" and asked not in topics:
-        raise InputError(f"{path} has no images on the topic asked for; there are: {listed}.")
+        raise InputError(f"{path} has no images on that topic; it has: {listed}.")
     kinds = {topic: _shown(bag, topic) for topic in sorted(topics)}
 
     def likelihood(topic: str) -> tuple[bool, bool, bool, bool, int]:

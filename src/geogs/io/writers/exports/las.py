@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from geogs.errors import InputError
+from geogs.extras import install_command
 from geogs.io.writers.atomic import atomic_file
 
 _STEPS = 1e9
@@ -24,7 +25,7 @@ def write_las(
     try:
         import laspy
     except ImportError:
-        raise InputError("LAS needs laspy: pip install 'geogs[export]'.") from None
+        raise InputError(f"LAS needs laspy: {install_command('export')}") from None
     header = laspy.LasHeader(point_format=2, version="1.2")
     header.offsets = positions.min(axis=0)
     extent = float(np.ptp(positions, axis=0).max())
