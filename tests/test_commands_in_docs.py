@@ -84,7 +84,7 @@ def place(small_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.system
-@pytest.mark.long  # two pages with a run each, and a reconstruction: a minute
+@pytest.mark.long  # two runs and a reconstruction: a minute
 @pytest.mark.parametrize("name", ["README.md", "docs/tutorials/colmap.md"])
 def test_a_page_runs_as_it_stands(place: Path, name: str, capsys):
     for command, *words in commands(ROOT / name):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from geogs.config.setting import Basic, Formerly, NamesFile, Only, Range, Settings
+from geogs.config.setting import Basic, Formerly, Moment, NamesFile, Only, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ class InputConfig(Settings, group="input"):
     back or 360:YAW,PITCH (degrees to the right and upwards), a view of 90 degrees of a 360-degree
     panorama; a half and a view joined by +, such as top+front. auto takes all and refuses stereo
     pairs and panoramas, none takes all unasked. Given intrinsics hold for the part."""
-    start: Annotated[int, Range(0), Basic("--start")] = 0
-    """First frame of the source, from 0."""
-    stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None
-    """Frame of the source before which to stop; none reads to the end."""
+    start: Annotated[int | str, Moment(), Range(0), Basic("--start")] = 0
+    """First frame of the source, from 0, or a time in it, such as 90s or 1:30."""
+    stop: Annotated[int | str | None, Moment(), Range(above="start"), Basic("--stop")] = None
+    """Frame before which to stop, or a time, such as 90s or 1:30; none reads to the end."""
     stride: Annotated[int, Range(1), Basic("--stride")] = 1
     """Use every stride-th frame."""

@@ -53,7 +53,7 @@ class Range:
         Without a group, bounds by other settings are not looked at.
         """
         least, most, above, below = (
-            getattr(group, bound, None) if isinstance(bound, str) else bound
+            _number(getattr(group, bound, None)) if isinstance(bound, str) else bound
             for bound in self.bounds
         )
         return (self.or_zero and value == 0) or (
@@ -137,6 +137,10 @@ class Time:
     """Seconds that an option may give as ``90s``, ``10m`` or ``1.5h``, too."""
 
 
+class Moment:
+    """A frame by its number, or by its time in the source: ``90s``, ``1.5m``, ``1:30``."""
+
+
 class Unnamed:
     """A group whose settings stand at the top of the command line, without its name."""
 
@@ -178,6 +182,8 @@ class Kind:
         inner = get_args(annotation)
         if origin is Annotated:
             return Kind.of(inner[0], (*inner[1:], *marks))
+        if any(isinstance(mark, Moment) for mark in marks) and annotation is not int:
+            return replace(Kind.of(int, marks), is_optional=type(None) in inner)
         if origin in (Union, types.UnionType) and len(inner) == 2:
             instead = get_args(inner[1]) if get_origin(inner[1]) is Literal else ()
             if inner[1] is type(None):
@@ -235,14 +241,21 @@ class Kind:
             text += ", as seconds or such as 90s, 10m or 1h,"
         if str(self.range):
             text += f" {self.range}"
+        text += ", or a time such as 90s or 1:30" if self._is_moment else ""
         if self.choices:
             text = " or ".join(self.choices)
         text = f"{self.word} or {text}" if self.word else text
         return f"none or {text}" if self.is_optional else text
 
+    @property
+    def _is_moment(self) -> bool:
+        return any(isinstance(mark, Moment) for mark in self.marks)
+
     def _allows_one(self, value: object, group: object) -> bool:
         if self.choices:
             return value in self.choices
+        if self._is_moment and isinstance(value, str):
+            return seconds_of(value) is not None
         if self.base not in (int, float):
             return isinstance(value, self.base)
         number = Integral if self.base is int else Real
@@ -252,15 +265,37 @@ class Kind:
         return finite and self.range.holds(value, group)  # type: ignore[arg-type]
 
     def _read_one(self, text: str) -> object:
-        units = [unit for unit in _SECONDS if Time in self.marks and text.endswith(unit)]
         if self.base is Path and not text:  # which Python takes for the working folder
             return text
         try:
-            if units:
-                return _SECONDS[units[0]] * float(text.removesuffix(units[0]))
+            if Time in self.marks and (seconds := seconds_of(text)) is not None:
+                return seconds
             return self.base(text)
         except ValueError:
             return text
+
+
+def seconds_of(text: str) -> float | None:
+    """The seconds of a time such as ``90s``, ``1.5m``, ``2h``, ``1:30`` or ``1:02:30``; none where
+    it is none."""
+    parts = text.split(":")
+    unit = next((unit for unit in _SECONDS if text.endswith(unit)), "")
+    try:
+        if 2 <= len(parts) <= 3:
+            hours, minutes = [0, *map(int, parts[:-1])][-2:]
+            seconds = 3600.0 * hours + 60 * minutes + float(parts[-1])
+        elif unit:
+            seconds = _SECONDS[unit] * float(text.removesuffix(unit))
+        else:
+            return None
+    except ValueError:
+        return None
+    return seconds if math.isfinite(seconds) and seconds >= 0 and "-" not in text else None
+
+
+def _number(value: object) -> Any:
+    """A bound by another setting; none where that is a time, which no number is compared with."""
+    return None if isinstance(value, str) else value
 
 
 class Settings:

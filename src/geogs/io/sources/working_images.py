@@ -42,6 +42,7 @@ from geogs.io.sources.reader import (
     read_ahead,
     read_side_by_side,
 )
+from geogs.io.sources.selection import selection_of
 from geogs.io.sources.undistort import Rectifier, mask_as_image, window_around
 from geogs.threads import Each
 from geogs.types import MeasuredDepth, SeenRows
@@ -78,7 +79,8 @@ class WorkingImages:
         ``poses`` by the clock of the images, and ``depth``, instead of the settings'.
         """
         info = reader.info
-        if info.length is not None and config.start >= info.length:
+        self._selection = selection_of(config, info.fps)
+        if info.length is not None and self._selection.start >= info.length:
             raise InputError(
                 f"start is {config.start}, but the source has only {info.length} frames; give a "
                 "smaller one."
@@ -220,21 +222,21 @@ class WorkingImages:
         if self.is_live:
             return iter(())
         info = self.reader.info
-        config = self._config
+        chosen = self._selection
         length = info.length
         if length is None and info.seconds is not None:
             length = round(info.seconds * info.fps)
-        places = range(length or config.start + MOST_COMPARED)[config.start : config.stop]
+        places = range(length or chosen.start + MOST_COMPARED)[chosen.start : chosen.stop]
         if length and places and isinstance(self.reader, SpreadReader):
-            chosen = np.unique(np.linspace(0, len(places) - 1, count).round().astype(int))
-            entered = self.reader.spread([places[k] for k in chosen.tolist()])
+            numbers = np.unique(np.linspace(0, len(places) - 1, count).round().astype(int))
+            entered = self.reader.spread([places[k] for k in numbers.tolist()])
             found = list(map(self._at_working_size, entered))
             if 2 * len(found) >= count:
                 return iter(found)
         beginning = places[:MOST_COMPARED]
         step = max(len(beginning) // count, 1)
-        stop = config.start + len(beginning)
-        return map(self._at_working_size, self.reader.read(config.start, stop, step))
+        stop = chosen.start + len(beginning)
+        return map(self._at_working_size, self.reader.read(chosen.start, stop, step))
 
     @property
     def takes(self) -> str:
@@ -272,8 +274,8 @@ class WorkingImages:
         length = self.reader.info.length
         if length is None:
             return None
-        config = self._config
-        return len(range(length)[config.start : config.stop : config.stride])
+        chosen = self._selection
+        return len(range(length)[chosen.start : chosen.stop : chosen.stride])
 
     def read(self, first: int) -> Iterator[RawFrame]:
         """Read the selection from its ``first`` image on; unless it is live, the next one is read
@@ -283,14 +285,14 @@ class WorkingImages:
 
     def _working(self, first: int) -> Iterator[RawFrame]:
         """The working images of the selection from its ``first`` on."""
-        config = self._config
+        chosen = self._selection
         reader = self.reader
-        start = config.start + first * config.stride
+        start = chosen.start + first * chosen.stride
         if self.shutter.readout:
             yield from self._with_rows_rectified(start)
             return
         rows = self._open_rows()
-        for raw in reader.read(start, config.stop, config.stride):
+        for raw in reader.read(start, chosen.stop, chosen.stride):
             raw = of_one_size(raw, reader.info)
             if raw.image is not None:
                 image = self._rectifier(raw.image)
@@ -334,16 +336,16 @@ class WorkingImages:
         Rotation is measured between neighbours in the source, whatever the stride, and the
         image before the first is read, too.
         """
-        config = self._config
+        chosen = self._selection
         rolling = self.rolling_camera
         readout = self.shutter.readout
         before = min(start, 1)
-        stop = None if config.stop is None else config.stop + 1
-        end = math.inf if config.stop is None else config.stop - start
+        stop = None if chosen.stop is None else chosen.stop + 1
+        end = math.inf if chosen.stop is None else chosen.stop - start
 
         def is_selected(position: int) -> bool:
             after = position - before
-            return 0 <= after < end and after % config.stride == 0
+            return 0 <= after < end and after % chosen.stride == 0
 
         images = map(self._at_working_size, self.reader.read(start - before, stop, 1))
         offsets = RowOffsets(rolling, self.camera)
@@ -369,7 +371,7 @@ class WorkingImages:
             read: number of images of the selection, unusable ones included.
             last: time of the last one, seconds.
         """
-        seconds = None if self._config.stop is not None else self.reader.info.seconds
+        seconds = None if self._selection.stop is not None else self.reader.info.seconds
         if self.length is not None and read < MOST_OF * self.length - 1:
             missing = f"says that it has {self.length} images here, but only {read} came"
         elif seconds is not None and last < MOST_OF * seconds - 0.5:
@@ -382,9 +384,9 @@ class WorkingImages:
         """Message where all images were skipped, or there are none."""
         if skipped:
             return f"{self.name}: none of its {skipped} images can be used."
-        if not self._config.start:
+        if not self._selection.start:
             return f"{self.name} ended before its first image."
-        return f"{self.name} ends before frame {self._config.start}; give a smaller start."
+        return f"{self.name} ends before frame {self._selection.start}; give a smaller start."
 
 
 def check_large_enough(camera: Camera, name: str) -> None:

@@ -15,6 +15,7 @@ from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_set import PosedSet, SparsePoints, without_invalid_poses
 from geogs.io.sources.posed.stored_pictures import stored_size
 from geogs.io.sources.reader import fingerprint_of, read_ahead, size_of
+from geogs.io.sources.selection import Selection, selection_of
 from geogs.io.sources.working_images import check_large_enough
 
 
@@ -44,9 +45,10 @@ class PosedSource:
 
     def __init__(self, posed: PosedSet, config: InputConfig, hold_out: int | None = None) -> None:
         """Every ``hold_out``-th of the selected images is left out."""
-        posed = _selected(without_invalid_poses(_present(posed)), config)
+        chosen = selection_of(config, None)
+        posed = _selected(without_invalid_poses(_present(posed)), chosen)
         left_out = held_out_places(len(posed.files), hold_out)
-        self.held_out: list[int] = [config.start + config.stride * i for i in left_out]
+        self.held_out: list[int] = [chosen.start + chosen.stride * i for i in left_out]
         """Indices of the images left out, in the source with neither start nor stride, from 0."""
         if left_out:
             posed = posed.only(sorted(set(range(len(posed.files))) - set(left_out)))
@@ -205,11 +207,11 @@ def _without_unlike(posed: PosedSet, unlike: dict[int, str]) -> PosedSet:
     )
 
 
-def _selected(posed: PosedSet, config: InputConfig) -> PosedSet:
-    kept = range(len(posed.files))[config.start : config.stop : config.stride]
+def _selected(posed: PosedSet, chosen: Selection) -> PosedSet:
+    kept = range(len(posed.files))[chosen.start : chosen.stop : chosen.stride]
     if not kept:
         raise InputError(
-            f"{posed.name}: images {config.start} to {config.stop} of its {len(posed.files)} "
+            f"{posed.name}: images {chosen.start} to {chosen.stop} of its {len(posed.files)} "
             f"are none; choose others."
         )
     return posed if len(kept) == len(posed.files) else posed.only(kept)
