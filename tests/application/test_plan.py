@@ -42,9 +42,11 @@ def test_stages_follow_from_what_is_known(tmp_path, intrinsics, readout, refine,
         input=InputConfig(intrinsics, readout=readout), calibration=CalibrationConfig(refine)
     )
     source = open_source([tmp_path], config.input)
-    found = run_stages(RunSettings((tmp_path,), config), source)
+    settings = RunSettings((tmp_path,), config)
+    found = run_stages(settings, source, maps_at_end=True)
     assert found == (("calibration", *LAST) if calibrates else LAST)
-    assert run_stages(replace(RunSettings((tmp_path,), config), sfm=True), source) == ()
+    assert "map refinement" in run_stages(settings, source, maps_at_end=False)
+    assert run_stages(replace(settings, sfm=True), source, maps_at_end=True) == ()
 
 
 def test_time_is_that_of_results_beside_it(tmp_path):

@@ -34,13 +34,17 @@ class Earlier:
     """Bytes."""
 
 
-def run_stages(settings: RunSettings, source: Source) -> tuple[str, ...]:
-    """Names of the stages of a run, in order; none where they follow from what is found."""
+def run_stages(settings: RunSettings, source: Source, maps_at_end: bool) -> tuple[str, ...]:
+    """Names of the stages of a run, in order; none where they follow from what is found.
+
+    ``maps_at_end``: whether the map is made once, after the video.
+    """
     if settings.sfm:
         return ()
     is_open = settings.config.calibration.refine and source.is_calibration_open
     first = ("calibration",) if is_open or source.is_shutter_open else ()
-    return (*first, "frames", "bundle adjustment", "mapping", "mesh", "report")
+    mapping = "mapping" if maps_at_end else "map refinement"
+    return (*first, "frames", "bundle adjustment", mapping, "mesh", "report")
 
 
 @dataclass(frozen=True)

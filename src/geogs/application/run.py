@@ -65,7 +65,7 @@ def run(
     base = None if settings.map is None else load_result(settings.map, device)
     opened = opened_for(settings, base)
     _check_input(settings, opened, progress)
-    progress.stages(run_stages(settings, opened))
+    progress.stages(run_stages(settings, opened, defers_map))
     wanted = settings.output or Path("out") / opened.stem
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")

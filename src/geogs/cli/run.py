@@ -63,19 +63,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
         raise InputError("--map needs tracking; leave out --sfm.")
 
     if options.dry_run:
-        from geogs.application.calibrate import without_overlay
-        from geogs.application.plan import plan_for, run_stages
-        from geogs.application.progress.terminal_progress import TerminalProgress
-        from geogs.application.results.output_folder import chosen_folder
-        from geogs.io.sources.sniff import open_source
-
-        opened = open_source(options.source, options.config.input)
-        opened = without_overlay(opened, TerminalProgress(options))
-        stages = run_stages(record(RunSettings, options), opened)
-        frames = None if opened.is_live else opened.length
-        output = chosen_folder(options.output, opened.stem, options.overwrite)
-        device = "cuda" if is_gpu(options.device) else "cpu"
-        return dry_answer(opened, plan_for(stages, output, frames, opened.camera, device))
+        return _dry_run(options)
     say_loading(options)
     start_gpu(options.device)
     from geogs.application.interrupt import Interruption
@@ -97,6 +85,25 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
             "geogs run --resume {folder} continues from here.",
             options.strict,
         )
+
+
+def _dry_run(options: RunOptions) -> Answer:
+    """What the input holds and would be done."""
+    from geogs.application.calibrate import without_overlay
+    from geogs.application.plan import plan_for, run_stages
+    from geogs.application.progress.terminal_progress import TerminalProgress
+    from geogs.application.results.output_folder import chosen_folder
+    from geogs.application.run import maps_at_the_end
+    from geogs.io.sources.sniff import open_source
+
+    opened = open_source(options.source, options.config.input)
+    opened = without_overlay(opened, TerminalProgress(options))
+    settings = record(RunSettings, options)
+    stages = run_stages(settings, opened, maps_at_the_end(settings, None))
+    frames = None if opened.is_live else opened.length
+    output = chosen_folder(options.output, opened.stem, options.overwrite)
+    device = "cuda" if is_gpu(options.device) else "cpu"
+    return dry_answer(opened, plan_for(stages, output, frames, opened.camera, device))
 
 
 def _observer(options: LiveSettings) -> "RunObserver | None":

@@ -126,7 +126,7 @@ def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
     said = stop([*map(str, call)], signal.SIGINT, checkpoints=1)
-    assert "--resume goes on" in said
+    assert "--resume continues" in said
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
     assert checkpoint.is_file()
     assert cli.main([*map(str, call), "--resume", "--mapping.disk.stride", "9"]) == 2
