@@ -103,6 +103,19 @@ def test_a_former_name_does_the_same_and_names_the_new_one(old, new, command, ca
     assert old.split("=")[0].split()[0].replace("_", "-") in warning
 
 
+@pytest.mark.parametrize(
+    "words", [["-o", "out", "--resume"], ["--resume", "--seed", "1", "--output", "out"]]
+)
+def test_a_bare_resume_takes_the_folder_of_the_output(words, caplog) -> None:
+    found = reconstruct.parse(["x", "--device", "cpu", *words])
+    assert found.resume == Path("out")
+    assert "--resume is now --resume out;" in caplog.messages[0]
+    with pytest.raises(InputError, match="needs the folder"):
+        reconstruct.parse(["x", "--resume", "--device", "cpu"])
+    given = reconstruct.parse(["x", "--resume", "there", "--device", "cpu"])
+    assert (given.resume, given.output) == (Path("there"), None)
+
+
 def test_a_former_name_is_offered_by_no_help_and_taken_by_no_other_option() -> None:
     for options, command in (
         (run.RunOptions, "run"),

@@ -137,9 +137,10 @@ def reconstruct_to_folder(
     else:
         source = open_posed_source(settings.source, config.input, settings.hold_out)
         name = without_ending(source.name, [settings.source])
-    may_replace = settings.overwrite or settings.resume
+    may_replace = settings.overwrite or settings.resume is not None
+    wanted = settings.resume or settings.output
     with (
-        claimed(chosen_folder(settings.output, name, may_replace, progress)) as output,
+        claimed(chosen_folder(wanted, name, may_replace, progress)) as output,
         compiling(device, knows_poses=True) as kernels,
     ):
         if finds_poses:
@@ -149,7 +150,7 @@ def reconstruct_to_folder(
                     config,
                     output,
                     settings.hold_out,
-                    settings.resume,
+                    settings.resume is not None,
                     progress,
                     stop,
                     settings.budget,
@@ -201,7 +202,7 @@ class MappedImages(Work):
 
     scene: Reconstruction
     source: PosedSource
-    way_on = "The same command with --resume continues from the last checkpoint."
+    way_on = "The same command with --resume OUT continues from the last checkpoint."
 
     def __init__(
         self, scene: Reconstruction, source: PosedSource, settings: ReconstructSettings
@@ -235,7 +236,7 @@ class MappedImages(Work):
         scene = self.scene
         progress = driver.progress
         resumed = None
-        if settings.resume:
+        if settings.resume is not None:
             resumed = read_work(driver.output, self._made_from)
             place = resumed.map.place
             done = f"step {place.steps} of {place.total}" if place.steps else "the depths"

@@ -103,8 +103,8 @@ class ReconstructSettings(Settings):
     """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
     keyframe_images: Annotated[bool, RARE] = True
     """Keep the images as they were used in keyframes/, which geogs mesh and geogs export use."""
-    resume: bool = False
-    """Go on from the checkpoint that an earlier call left in the output folder."""
+    resume: Path | None = None
+    """Go on with the reconstruction that stopped in this folder: give its source and settings."""
     checkpoint_every: Annotated[Weight, RARE] = 30.0
     """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
     none."""

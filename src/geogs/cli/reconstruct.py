@@ -1,5 +1,7 @@
 """``geogs reconstruct SOURCE``: images with known poses, or photographs, in; mesh and map out."""
 
+import itertools
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +13,10 @@ from geogs.cli.config_options import ConfigOptions, printed, with_settings_file
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.terminal.speech import dry_answer, followed, say_loading
 from geogs.config import Preset, reconstruct_preset
+from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ def main(argv: Sequence[str]) -> Answer | int:
         source = open_posed_source(options.source, options.config.input, options.hold_out)
         source = with_focal_length(source)
         name = without_ending(source.name, [options.source])
-        output = chosen_folder(options.output, name, options.overwrite or options.resume)
+        output = chosen_folder(options.output, name, options.overwrite)
         device = "cuda" if is_gpu(options.device) else "cpu"
         plan = plan_for(POSED_STAGES, output, len(source), source.camera, device)
         return dry_answer(source, plan)
@@ -63,7 +68,7 @@ def main(argv: Sequence[str]) -> Answer | int:
         options,
         lambda progress: reconstruct_to_folder(settings, progress, stop),
         stop,
-        "The same command with --resume continues from here.",
+        "The same command with --resume {folder} continues from here.",
     )
 
 
@@ -74,7 +79,25 @@ def parse(argv: Sequence[str]) -> ReconstructOptions:
         SystemExit: after ``--help``.
         InputError: an option is wrong or missing.
     """
-    return parse_options(ReconstructOptions, argv, "reconstruct", _defaults)
+    return parse_options(ReconstructOptions, _with_folder(argv), "reconstruct", _defaults)
+
+
+def _with_folder(argv: Sequence[str]) -> list[str]:
+    """The arguments with the folder of ``-o`` after a ``--resume`` without one, as in the last
+    version. Raises InputError where there is none."""
+    words = list(argv)
+    followed_by = itertools.zip_longest(words, words[1:], fillvalue="-")
+    bare = [
+        n for n, (word, after) in enumerate(followed_by) if word == "--resume" and after[:1] == "-"
+    ]
+    if not bare:
+        return words
+    folders = [after for word, after in itertools.pairwise(words) if word in ("-o", "--output")]
+    if not folders:
+        raise InputError("--resume needs the folder of the reconstruction that stopped.")
+    _log.warning("--resume is now --resume %s; a bare one goes in the next version.", folders[-1])
+    words.insert(bare[0] + 1, folders[-1])
+    return words
 
 
 def _defaults(given: Given) -> ReconstructOptions:

@@ -126,20 +126,21 @@ def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
     said = stop([*map(str, call)], signal.SIGINT, checkpoints=1)
-    assert "--resume continues" in said
+    assert f"--resume {tmp_path} continues" in said
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
     assert checkpoint.is_file()
-    assert cli.main([*map(str, call), "--resume", "--mapping.disk.stride", "9"]) == 2
+    go_on = [*map(str, call), "--resume", str(tmp_path)]
+    assert cli.main([*go_on, "--mapping.disk.stride", "9"]) == 2
     said = capsys.readouterr().err
     assert "other settings" in said.splitlines()[-1]
     assert "Traceback" not in said
-    assert cli.main([*map(str, call), "--resume"]) == 0
+    assert cli.main(go_on) == 0
     assert "Continuing after" in capsys.readouterr().err
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["interrupted"] is False
     assert "depth" not in summary["seconds"]
     assert not checkpoint.parent.exists()
-    assert cli.main([*map(str, call), "--resume"]) == 2
+    assert cli.main(go_on) == 2
     assert "nothing to resume" in capsys.readouterr().err.splitlines()[-1]
     seen = vertices(small_room / "points_seen_1cm.ply")
     accuracy = cKDTree(seen).query(surface_points(tmp_path / "mesh.ply"))[0]
