@@ -1,0 +1,85 @@
+"""Commands one after the other, interrupted, failed or killed: no result is lost unasked."""
+
+import json
+import random
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from disk_faults import full_disk
+from geogs.application import driver
+from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.interrupt import Stop
+from geogs.application.progress.run_progress import RunProgress
+from geogs.application.results.output_folder import chosen_folder, claimed, is_complete
+from geogs.application.run_settings import RunSettings
+from geogs.errors import GeogsError, TrackingLost
+from geogs.io.sources.frame_source import Source
+from geogs.stopwatch import Stopwatch
+
+ENDS = (
+    Outcome.FINISHED, Outcome.FINISHED, Outcome.STOPPED, Outcome.MEMORY_FULL,
+    TrackingLost("nothing was tracked"), KeyboardInterrupt(), "full disk",
+)  # fmt: skip
+
+
+class Ending(Work):
+    """Work that ends in some way, at once."""
+
+    source = Source.__new__(Source)  # nothing is read from it
+
+    def __init__(self, number: int, source: str, end: object) -> None:
+        summary = {"source": source, "number": number}
+        self.scene = SimpleNamespace(frames=9, stopwatch=Stopwatch(), summary=summary)
+        self._end = end
+
+    def complete(self, driver: Driver, checkpoint: object, new: Path) -> Outcome:
+        if isinstance(self._end, BaseException):
+            raise self._end
+        return self._end if isinstance(self._end, Outcome) else Outcome.FINISHED
+
+
+def run(number: int, source: str, given: str, overwrite: bool, end: object) -> None:
+    """A run as the command does it."""
+    settings = RunSettings(checkpoint_every=0.0, depth_mesh=False)
+    disk = full_disk(Path.cwd(), 5) if end == "full disk" else nullcontext()
+    with suppress(GeogsError, KeyboardInterrupt):
+        folder = chosen_folder(Path(given) if given else None, source, overwrite)
+        with claimed(folder) as output, disk:
+            made = Driver(settings, output, torch.device("cpu"), RunProgress(), Stop())
+            made.complete(Ending(number, source, end))
+
+
+def numbers() -> dict[int, bool]:
+    """Which results are there, and whether they are complete."""
+    paths = Path().glob("**/summary.json")
+    return {json.loads(p.read_text())["number"]: is_complete(p.parent) for p in paths}
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_complete_result_goes_only_where_that_was_asked_for(tmp_path, monkeypatch, seed):
+    def write(new: Path, result: object, *_: object) -> None:
+        summary = result.scene.summary | {"interrupted": result.is_interrupted}
+        (new / "trajectory.tum").write_text("0 0 0 0 0 0 0 1\n")
+        (new / "mesh.ply").write_bytes(bytes(4000))
+        (new / "summary.json").write_text(json.dumps(summary))
+
+    monkeypatch.setattr(driver, "write_files", write)
+    monkeypatch.chdir(tmp_path)
+    rng = random.Random(seed)
+    for number in range(8):
+        before = numbers()
+        source, given = rng.choice(["a", "b"]), rng.choice(["", "", "kept", "out/a"])
+        overwrite, end = rng.random() < 0.3, rng.choice(ENDS)
+        run(number, source, given, overwrite, end)
+        after = numbers()
+        lost = {known for known in before if known not in after}
+        assert len(lost) <= overwrite, (number, source, given)
+        if any(before[known] for known in lost):
+            assert after.get(number) is True, (number, end)
+        if end is Outcome.FINISHED and (overwrite or not given):
+            assert after[number]
+        assert not list(tmp_path.glob("**/.geogs.*.new"))
