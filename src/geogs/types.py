@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.config.setting import Range
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import quaternion_to_matrix
+from geogs.geometry.lie import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from geogs.limits import UNBOUNDED, AtLeast0, Pose, Positive
 from geogs.short_repr import ShortRepr
 
@@ -219,6 +219,12 @@ class Trajectory:
             for t, o in zip(self.tracked, only, strict=True)
         ]
 
+    def rotated(self, R: Float64[np.ndarray, "3 3"]) -> "Trajectory":
+        """Return the same path in a world that ``R`` maps this one to."""
+        T = np.eye(4)
+        T[:3, :3] = R
+        return replace(self, T_wc=T @ self.T_wc)
+
     def of(self, state: FrameState) -> "Trajectory":
         """Return the frames of one state."""
         keep = np.array([known == state for known in self.states], bool)
@@ -337,6 +343,14 @@ class MapSnapshot:
         """Transform the disks of a map with this ``origin`` and ``unit`` to the world."""
         position = self.position * unit + torch.from_numpy(origin).to(self.position)
         return MapSnapshot(position, self.quaternion, self.scale * unit, self.opacity)
+
+    def rotated(self, R: Float64[np.ndarray, "3 3"]) -> "MapSnapshot":
+        """Return the disks in a world that ``R`` maps this one to."""
+        rotation = torch.from_numpy(R)
+        position = self.position.double() @ rotation.mT.to(self.position.device)
+        turn = matrix_to_quaternion(rotation).to(self.quaternion)
+        quaternion = quaternion_multiply(turn.expand_as(self.quaternion), self.quaternion)
+        return replace(self, position=position.to(self.position), quaternion=quaternion)
 
     def is_finite(self) -> bool:
         """Whether every number is finite."""

@@ -81,8 +81,8 @@ def test_pictures_are_written_whatever_is_known(tmp_path):
     )
     tracked = np.ones(60, bool)
     tracked[20:25] = False
-    draw_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))
+    draw_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked), np.eye(3), "m")
     assert len(drawn(np.array(Image.open(tmp_path / "p.png")), ORANGE)) > 50
     one = Trajectory(np.zeros(1), np.eye(4)[None], np.zeros(1, bool))
-    draw_path(tmp_path / "one.png", one)
+    draw_path(tmp_path / "one.png", one, np.eye(3), "map units")
     assert (tmp_path / "one.png").is_file()

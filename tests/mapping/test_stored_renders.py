@@ -123,7 +123,7 @@ def test_results_hold_few_maps(tmp_path):
     assert max(counts) <= 3
     T_wc = np.stack([torch.linalg.inv(r.T_cw).numpy() for r in renders])
     trajectory = Trajectory(np.arange(20.0), T_wc, np.ones(20, bool))
-    write_pictures(tmp_path / "report", trajectory, kept)
+    write_pictures(tmp_path / "report", kept)
     write_page(tmp_path / "report", trajectory, kept, mesh, {"source": "wall"})
     assert max(counts) <= 8  # five that are shown
 

@@ -157,7 +157,7 @@ def test_results_are_written_from_any_device(device, tmp_path):
     save_map(tmp_path / "map.safetensors", disks)
     T_wc = np.stack([torch.linalg.inv(r.T_cw.cpu()).numpy() for r in renders])
     trajectory = Trajectory(np.arange(6.0), T_wc, np.ones(6, bool))
-    write_pictures(tmp_path / "report", trajectory, renders)
+    write_pictures(tmp_path / "report", renders)
     write_page(tmp_path / "report", trajectory, renders, mesh, {"source": "room"})
     for name in ("trajectory", "keyframes"):
         assert (tmp_path / "report" / f"{name}.png").stat().st_size > 5000

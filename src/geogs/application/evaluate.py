@@ -11,7 +11,7 @@ from geogs.application.evaluate_surface import compare_surface, photoconsistency
 from geogs.application.result_settings import EvalSettings
 from geogs.application.results.output_folder import claimed, read_summary
 from geogs.application.results.result_page import shown_model, shown_views
-from geogs.application.results.saved_result import load_result
+from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.errors import InputError
 from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths, ShownModel
 from geogs.evaluation.pages.evaluation_page import SAME_POSES_CM, Evaluation, write_report
@@ -91,14 +91,15 @@ def _evaluated(settings: EvalSettings, new: Path) -> Evaluation:
     against = doubts(trajectory, known, scene.trajectory, settings.max_diff, is_metric)
     told = _reliability(settings.output, trajectory)
     evaluation = Evaluation(trajectory, keyframes, scores, compared, photo, told, tuple(against))
-    pictures = (
-        _draw(settings, new, evaluation, surface) if settings.plots else _run_pictures(settings)
-    )
+    result = _saved(settings.output) if settings.plots else None
+    pictures = _run_pictures(settings)
+    if settings.plots:
+        pictures = [*_draw(settings, new, evaluation, surface, result), *pictures]
     page = new / "report" / "index.html"
     title = str(summary.get("source", settings.output.resolve().name))
     run = run_sections(summary) if summary else []
     judged = figures(summary, run_figures(summary)[:4]) if summary else None
-    model = _model_beside_truth(settings.output, trajectory, surface) if settings.plots else None
+    model = None if result is None else _model_beside_truth(result, trajectory, surface)
     write_report(evaluation, new / "eval.json", page, pictures, run, title, judged, model)
     return evaluation
 
@@ -159,18 +160,33 @@ def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
     return mesh or points, points
 
 
+def _saved(folder: Path) -> SavedResult | None:
+    """The result; none where no map was saved, or it cannot be read."""
+    try:
+        result = load_result(folder)
+        result.upright  # noqa: B018  # reads trajectory and mesh
+    except InputError:
+        return None
+    return result
+
+
 def _draw(
-    settings: EvalSettings, new: Path, evaluation: Evaluation, surface: SurfaceComparison | None
+    settings: EvalSettings,
+    new: Path,
+    evaluation: Evaluation,
+    surface: SurfaceComparison | None,
+    result: SavedResult | None,
 ) -> list[tuple[str, Path]]:
-    """Draw the pictures of this command; these, then those of the run: titles and files."""
+    """Draw the pictures of this command. Returns their titles and files."""
     from geogs.evaluation.pages import plots
     from geogs.evaluation.pages.shading import viewpoints
 
     folder = new / "report"
     titles: dict[str, str] = {}
     trajectory = evaluation.trajectory
+    up = None if result is None else trajectory.T_ref_est[:3, :3] @ result.upright.axes[2]
     if trajectory.ate_max_cm > SAME_POSES_CM:
-        plots.plot_trajectory(folder / "trajectory_truth.png", trajectory)
+        plots.plot_trajectory(folder / "trajectory_truth.png", trajectory, up)
         plots.plot_error_over_time(folder / "trajectory_error.png", trajectory)
         titles["trajectory_truth.png"] = "Trajectory over the truth"
         titles["trajectory_error.png"] = "Error over time"
@@ -179,11 +195,10 @@ def _draw(
         titles["reliability.png"] = "Are errors as large as predicted?"
     if surface is not None:
         camera = read_camera(settings.output / "intrinsics.json")
-        views = viewpoints(surface.mesh.vertices, trajectory.aligned, camera)
+        views = viewpoints(surface.mesh.vertices, trajectory.aligned, camera, up)
         plots.plot_beside_truth(folder / "mesh_truth.png", surface, views)
         titles = {"mesh_truth.png": "Surface beside the truth", **titles}
-    own = [(title, folder / name) for name, title in titles.items()]
-    return own + _run_pictures(settings)
+    return [(title, folder / name) for name, title in titles.items()]
 
 
 def _run_pictures(settings: EvalSettings) -> list[tuple[str, Path]]:
@@ -192,21 +207,15 @@ def _run_pictures(settings: EvalSettings) -> list[tuple[str, Path]]:
 
 
 def _model_beside_truth(
-    folder: Path, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
-) -> ShownModel | None:
-    """The model for the page of an evaluated result; none where no map was saved.
+    result: SavedResult, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
+) -> ShownModel:
+    """The model for the page of an evaluated result.
 
     Args:
-        folder: folder of the result.
+        result: the result.
         trajectory: its errors in metres, with the similarity from the map to the truth.
         surface: the comparison of its mesh, in metres, if there is one.
     """
-    try:
-        result = load_result(folder)
-        views = shown_views(result)
-        mesh = result.mesh
-    except InputError:
-        return None
     from geogs.evaluation.pages.plots import ERROR_STOPS, error_colours
 
     T = trajectory.T_ref_est
@@ -227,4 +236,5 @@ def _model_beside_truth(
     unit = Lengths(trajectory.scale, "Metres, by comparison with the truth.")
     frames = result.trajectory
     camera = result.camera
-    return shown_model(frames, views, camera, mesh, disks, unit, coloured, true_path)
+    views = shown_views(result)
+    return shown_model(frames, views, camera, result.mesh, disks, unit, coloured, true_path)

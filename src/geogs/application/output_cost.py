@@ -169,7 +169,7 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
         except InputError:  # these views show no surface; others may
             times("merge", 1, 1)
         fused = clock()
-        write_pictures(Path(folder) / "report", scene.trajectory(), renders)
+        write_pictures(Path(folder) / "report", renders)
         write_page(Path(folder) / "report", scene.trajectory(), renders, mesh, {})
         report = clock() - fused
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)

@@ -34,6 +34,8 @@ class ExportSettings(Settings):
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder or file; export/FORMAT in the folder of the result if none is given. A cloud that ends
     in .las becomes LAS, else PLY."""
+    as_tracked: bool = False
+    """Keep the axes of the run, or of the poses that were given, instead of standing upright."""
     text: bool = False
     """Write a COLMAP model as text, which is binary otherwise."""
     points: Annotated[int, Range(100, 10_000_000)] = 50_000

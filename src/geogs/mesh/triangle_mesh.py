@@ -1,6 +1,6 @@
 """The records of mesh extraction: its input and output."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,6 +66,11 @@ class Mesh:
         vertices = np.asarray(vertices, np.float32)
         faces = np.asarray(faces, np.int32).reshape(-1, 3)
         return Mesh(vertices, faces, vertex_normals(vertices, faces))
+
+    def rotated(self, R: Float[np.ndarray, "3 3"]) -> "Mesh":
+        """The mesh in a world that ``R`` maps this one to."""
+        vertices, normals = ((a @ R.T).astype(np.float32) for a in (self.vertices, self.normals))
+        return replace(self, vertices=vertices, normals=normals)
 
     def creased(self) -> "Mesh":
         """A mesh that looks the same, with vertices of their own on each side of a sharp edge."""

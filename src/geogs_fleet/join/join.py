@@ -242,7 +242,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     written = load_result(join.output, join.device)
     report = join.output / "report"
     renders = written.renders
-    write_pictures(report, trajectory, renders)
+    write_pictures(report, renders)
     write_page(report, trajectory, renders, mesh, summary, written.disks)
     return Joint(join.output, tuple(unjoined), summary["verdict"]["sentence"])
 

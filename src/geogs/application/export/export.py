@@ -37,6 +37,9 @@ _FILES: dict[Format, tuple[str, ...]] = {
     "tum": ("trajectory.txt", ".txt", ".tum"),
 }
 """Formats of a single file: its default name, and the allowed endings."""
+_Y_DOWN = frozenset({"colmap", "kitti", "gsplat", "splats", "glb", "obj"})
+"""Formats of worlds with y down, which viewers of COLMAP and of splats expect, and which the writers
+of meshes turn to y up; others have z up."""
 _SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
 """Endings of files; a folder has none of these."""
 
@@ -50,8 +53,11 @@ def export(settings: ExportSettings) -> Path:
         OutputError: a file cannot be written.
         DeviceError: the device cannot be used.
     """
-    result = load_result(settings.result, require_device(settings.device))
     to = settings.to
+    result = load_result(settings.result, require_device(settings.device))
+    if not settings.as_tracked:
+        stands = result.upright
+        result = result.rotated(stands.y_down if to in _Y_DOWN else stands.axes)
     place = settings.output or result.folder / "export" / settings.to
     name, *suffixes = _FILES.get(to, (to,))
     if to == "glb" and settings.textured:  # beside the plain one

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.application.results.saved_result import SavedResult
-from geogs.evaluation.model_view.levelling import Facets, Level, facets, level
+from geogs.application.results.upright import tracked_poses, upright
+from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.model_view.room import find_room
 from geogs.evaluation.model_view.shown_model import (
     Colouring,
@@ -22,7 +23,7 @@ from geogs.evaluation.model_view.shown_model import (
     ShownModel,
     SurfaceModel,
 )
-from geogs.evaluation.model_view.start_view import StartView, start_view
+from geogs.evaluation.model_view.start_view import start_view
 from geogs.evaluation.pages.run_page import lengths, write_run_page
 from geogs.geometry.camera import Camera
 from geogs.mesh.decimation.decimate import with_at_most
@@ -48,24 +49,21 @@ class ShownView:
     image: Callable[[], UInt8[np.ndarray, "h w 3"] | None]
 
 
-def write_pictures(
-    folder: Path, trajectory: Trajectory, renders: Sequence[RenderedKeyframe]
-) -> None:
-    """Draw the pictures of the page that need no mesh: the path, and renders beside images.
+def write_pictures(folder: Path, renders: Sequence[RenderedKeyframe]) -> None:
+    """Draw ``keyframes.png``: renders beside images, of up to five keyframes.
 
     Raises:
-        OutputError: a file cannot be written.
+        OutputError: the file cannot be written.
     """
     from geogs.evaluation.pages import run_pictures
 
-    run_pictures.draw_path(folder / "trajectory.png", trajectory)
-    if not renders:
+    if not len(renders):
         return
     numbers = np.linspace(0, len(renders) - 1, min(5, len(renders))).round().astype(int)
     shown = [renders[i] for i in numbers]
     run_pictures.draw_keyframes(
         folder / "keyframes.png",
-        [r.image for r in shown if r.image is not None],
+        [run_pictures.layer_picture(r, "image") for r in shown],
         [r.depth.cpu().numpy() for r in shown],
         [r.normal.cpu().numpy() for r in shown],
     )
@@ -79,7 +77,7 @@ def write_page(
     summary: Mapping[str, object],
     disks: MapSnapshot | None = None,
 ) -> None:
-    """Write the page of a result whose pictures are in its folder.
+    """Write the page of a result into the folder of its picture of keyframes.
 
     Raises:
         OutputError: a file cannot be written.
@@ -89,7 +87,7 @@ def write_page(
         views = _rendered_views(renders)
         camera = renders[0].camera
         model = shown_model(trajectory, views, camera, mesh, disks, lengths(summary))
-    write_run_page(folder, summary, model)
+    _write_with_path(folder, trajectory, mesh, summary, model)
 
 
 def write_page_anew(
@@ -99,7 +97,7 @@ def write_page_anew(
     trajectory: Trajectory | None = None,
     summary: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the page of a result again for a new mesh, if it has a page.
+    """Write the page of a result and its pictures again for a new mesh, if it has a page.
 
     ``new`` is the folder of its new files. Trajectory and summary default to those of the result.
 
@@ -114,8 +112,23 @@ def write_page_anew(
     faces = 0 if mesh is None else len(mesh.faces)
     views = shown_views(result)
     model = shown_model(trajectory, views, result.camera, mesh, result.disks, lengths(summary))
-    pictures = result.folder / "report"
-    write_run_page(new / "report", {**summary, "mesh_faces": faces}, model, pictures)
+    write_pictures(new / "report", result.keyframes)
+    _write_with_path(new / "report", trajectory, mesh, {**summary, "mesh_faces": faces}, model)
+
+
+def _write_with_path(
+    folder: Path,
+    trajectory: Trajectory,
+    mesh: Mesh | None,
+    summary: Mapping[str, Any],
+    model: ShownModel | None,
+) -> None:
+    """Draw the path, upright, and write the page with that and the picture of keyframes."""
+    from geogs.evaluation.pages.run_pictures import draw_path
+
+    up = upright(trajectory, mesh).axes if model is None else model.axes
+    draw_path(folder / "trajectory.png", trajectory, up, lengths(summary).name)
+    write_run_page(folder, summary, model)
 
 
 def shown_views(result: SavedResult) -> list[ShownView]:
@@ -181,7 +194,9 @@ def shown_model(
         paths.append(PathModel("True path", true_path))
     shape = None if surface is None else surface.vertices
     shape = shape if shape is not None or disk_model is None else disk_model.position
-    levelled, start = stand(trajectory, shape, seen)
+    T_wc = tracked_poses(trajectory)
+    levelled = upright(trajectory, mesh)
+    start = start_view(T_wc[:, :3, 3] if shape is None else shape, levelled.axes, T_wc, seen)
     return ShownModel(
         levelled.axes,
         start,
@@ -190,32 +205,10 @@ def shown_model(
         paths,
         _keyframes(views, camera),
         disk_model,
-        None if seen is None else find_room(seen, levelled.axes, _known(trajectory)),
+        None if seen is None else find_room(seen, levelled.axes, T_wc),
         unit,
-        [levelled.sentence, unit.note, *notes],
+        [unit.note, *notes],
     )
-
-
-def stand(
-    trajectory: Trajectory, points: Float[np.ndarray, "n 3"] | None, surface: Facets | None
-) -> tuple[Level, StartView]:
-    """Upright orientation and start view of a result.
-
-    Args:
-        trajectory: poses of all frames.
-        points: points of its shape, if it has one.
-        surface: its mesh, if it has one.
-    """
-    T_wc = _known(trajectory)
-    levelled = level(surface, T_wc)
-    points = T_wc[:, :3, 3] if points is None else points
-    return levelled, start_view(points, levelled.axes, T_wc, surface)
-
-
-def _known(trajectory: Trajectory) -> Float[np.ndarray, "k 4 4"]:
-    """Camera-to-world poses of the tracked frames, or of all where none is tracked."""
-    tracked = trajectory.tracked
-    return trajectory.T_wc[tracked] if tracked.any() else trajectory.T_wc
 
 
 def _surface(mesh: Mesh, more_colourings: Callable[[Mesh], Sequence[Colouring]]) -> SurfaceModel:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,13 @@ import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from geogs.application.results.output_folder import claimed, read_summary
+from geogs.application.results.upright import upright
 from geogs.application.results.verdict import Verdict
 from geogs.camera.shutter.rows import CELL
 from geogs.config.arguments import checks_arguments
 from geogs.documents import UNUSABLE, expanded
 from geogs.errors import InputError
+from geogs.evaluation.model_view.levelling import Level
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.geometry.lie import se3_inverse
@@ -97,6 +99,8 @@ class SavedResult:
     disks: MapSnapshot
     """Disks in the world, on the chosen device."""
     views: MapViews
+    rotation: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """From the world of the files to that of disks, views, trajectory and mesh."""
 
     def __repr__(self) -> str:
         counts = f"{len(self.views.keyframe_id)} keyframes, {len(self.disks)} disks"
@@ -118,11 +122,26 @@ class SavedResult:
         return self.views.render_camera
 
     @cached_property
+    def upright(self) -> Level:
+        """Upright orientation, as the page shows it. Raises InputError if a file is damaged."""
+        return upright(self.trajectory, self.mesh)
+
+    def rotated(self, R: Float64[np.ndarray, "3 3"]) -> "SavedResult":
+        """The result in a world that ``R`` maps this one to; files are read as they are."""
+        disks = self.disks.rotated(R)
+        views = self.views.rotated(R)
+        return replace(self, disks=disks, views=views, rotation=R @ self.rotation)
+
+    @cached_property
     def trajectory(self) -> Trajectory:
         """Poses of all frames; frames of unknown position are interpolated between neighbours.
 
         Raises InputError if a file of them is missing or damaged.
         """
+        return self._tracked().rotated(self.rotation)
+
+    def _tracked(self) -> Trajectory:
+        """Poses of all frames in the world of the files."""
         poses = read_frame_poses(self.folder)
         table = self.folder / "trajectory_uncertainty.csv"
         if not table.is_file():
@@ -146,7 +165,7 @@ class SavedResult:
     def mesh(self) -> Mesh | None:
         """The mesh as it was written; none if there is none. Raises InputError if it is damaged."""
         path = self.folder / "mesh.ply"
-        return read_mesh(path) if path.is_file() else None
+        return read_mesh(path).rotated(self.rotation) if path.is_file() else None
 
     @cached_property
     def verdict(self) -> Verdict | None:

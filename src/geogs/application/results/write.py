@@ -109,7 +109,7 @@ def _write_map(
 def _write_pictures(output: Path, result: Result, shown: Sequence[RenderedKeyframe]) -> None:
     """Draw the pictures of the report, in parallel to the mesh."""
     with result.scene.stopwatch.aside():
-        write_pictures(output / "report", result.trajectory, shown)
+        write_pictures(output / "report", shown)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:

@@ -4,11 +4,12 @@ import threading
 
 import numpy as np
 
-from geogs.application.results.result_page import stand
 from geogs.application.results.saved_result import SavedResult
+from geogs.application.results.upright import tracked_poses
 from geogs.application.viewer.browser_window import Window, reduced
 from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import facets
+from geogs.evaluation.model_view.start_view import start_view
 from geogs.evaluation.pages.run_pictures import layer_picture
 
 
@@ -23,8 +24,9 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
     trajectory = result.trajectory
     points = result.disks.position.cpu().numpy() if mesh is None else mesh.vertices
     surface = None if mesh is None else facets(mesh.vertices, mesh.faces, mesh.normals)
-    levelled, start = stand(trajectory, points, surface)
-    up = levelled.axes[2]
+    axes = result.upright.axes
+    start = start_view(points, axes, tracked_poses(trajectory), surface)
+    up = axes[2]
     window.stand_upright(up, float(np.linalg.norm(start.eye - start.target)))
     window.look_from(start, up)
     if mesh is not None:

@@ -47,11 +47,10 @@ class Level:
     """Fraction of the surface that is level or upright; none where the camera alone decided."""
 
     @property
-    def sentence(self) -> str:
-        """Message for the page."""
-        if self.share is None:
-            return "Upright as the camera was held."
-        return f"Upright by its planes: {self.share:.0%} of the surface are level or vertical."
+    def y_down(self) -> Float[np.ndarray, "3 3"]:
+        """The same axes as rows right, down, forward: those of a level camera."""
+        right, forward, up = self.axes
+        return np.stack([right, -up, forward])
 
 
 def facets(

@@ -99,6 +99,11 @@ class Lengths:
     note: str = ""
     """A sentence on the unit, for measurements in the page."""
 
+    @property
+    def name(self) -> str:
+        """Name of a map unit in plots."""
+        return {1.0: "m", 0.001: "mm"}.get(self.metres or 0.0, "map units")
+
 
 @dataclass(frozen=True)
 class ShownModel:

@@ -26,10 +26,15 @@ ERROR_STOPS = ("#ffffcc", "#fed976", "#fd8d3c", "#e2191c", "#800026")
 """CSS colours of :func:`error_colours` from zero to the largest error."""
 
 
-def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
-    """Plot the aligned estimate over the truth, from above and the side, coloured by its error."""
+def plot_trajectory(
+    path: Path, errors: TrajectoryErrors, up: Float[np.ndarray, "3"] | None = None
+) -> None:
+    """Plot the aligned estimate over the truth, from above and the side, coloured by its error.
+
+    ``up`` is of the true world; where it is not given, it is that of the cameras.
+    """
     figure = new_figure(11.0, 4.6)
-    axes = level_axes(errors.truth)
+    axes = level_axes(errors.truth, up)
     origin = errors.truth[:, :3, 3].mean(0)
     truth = (errors.truth[:, :3, 3] - origin) @ axes.T
     estimate = (errors.aligned[:, :3, 3] - origin) @ axes.T

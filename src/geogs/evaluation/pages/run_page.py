@@ -28,18 +28,14 @@ Show = Callable[[Any], str]
 
 
 def write_run_page(
-    folder: Path,
-    summary: Mapping[str, Any],
-    model: ShownModel | None = None,
-    pictures: Path | None = None,
+    folder: Path, summary: Mapping[str, Any], model: ShownModel | None = None
 ) -> None:
     """Write ``index.html``, which needs no other files.
 
     Args:
-        folder: ``report/`` of a result.
+        folder: ``report/`` of a result, with its pictures.
         summary: content of ``summary.json``; missing numbers are left out.
         model: interactive model at the top.
-        pictures: folder of the run's pictures; the same if none is given.
 
     Raises:
         OutputError: it cannot be written.
@@ -47,8 +43,7 @@ def write_run_page(
     name = _shown(str, summary.get("source")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
     head += [HtmlSection(*model_section(model))] if model is not None else []
-    place = folder if pictures is None else pictures
-    shown = [PictureSection(title, place / file) for file, title in PICTURES.items()]
+    shown = [PictureSection(title, folder / file) for file, title in PICTURES.items()]
     sections = [*head, *shown, *run_sections(summary)]
     write_page(folder / "index.html", name, sections, "geogs", is_whole=True)
 

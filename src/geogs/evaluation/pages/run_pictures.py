@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from geogs.evaluation.held_camera import level_axes
 from geogs.io.writers.atomic import atomic_file
 from geogs.types import RenderedKeyframe, Trajectory
 
@@ -25,20 +24,28 @@ _TICKS, _FINE = 6, 4
 """Approximate number of ticks on an axis; fractional bits of OpenCV's pixel coordinates."""
 
 
-def draw_path(path: Path, trajectory: Trajectory) -> None:
-    """Draw the camera path from above and the side, in map units; lost stretches are marked."""
-    axes = level_axes(trajectory.T_wc)
+def draw_path(
+    path: Path, trajectory: Trajectory, axes: Float[np.ndarray, "3 3"], unit: str = "map units"
+) -> None:
+    """Draw the camera path from above and the side; lost stretches are marked.
+
+    ``axes`` are rows right, forward and up of the world.
+    """
     points = (trajectory.T_wc[:, :3, 3] - trajectory.T_wc[0, :3, 3]) @ axes.T
     names = (("from above", "forward", 1), ("from the side", "up", 2))
     panels = [
-        path_panel(points[:, [0, vertical]], ~trajectory.tracked, name, upwards)
+        path_panel(points[:, [0, vertical]], ~trajectory.tracked, name, upwards, unit)
         for name, upwards, vertical in names
     ]
     save_picture(path, np.hstack(panels))
 
 
 def path_panel(
-    points: Float[np.ndarray, "n 2"], lost: Bool[np.ndarray, "n"], name: str, upwards: str
+    points: Float[np.ndarray, "n 2"],
+    lost: Bool[np.ndarray, "n"],
+    name: str,
+    upwards: str,
+    unit: str = "map units",
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw a path on a grid of equal scale, with its start and lost parts."""
     width, height = _PANEL
@@ -63,8 +70,8 @@ def path_panel(
     (start,) = _fine(place(points[:1])).tolist()
     cv2.circle(panel, start, 5 << _FINE, _PATH, -1, cv2.LINE_AA, _FINE)
     _write(panel, name, (_LEFT, 18), 0.5)
-    _write(panel, f"{upwards} (map units)", (8, 38))
-    _write(panel, "right (map units)", (width // 2 - 40, height - 8))
+    _write(panel, f"{upwards} ({unit})", (8, 38))
+    _write(panel, f"right ({unit})", (width // 2 - 40, height - 8))
     cv2.circle(panel, (width - 170, 14), 5, _PATH, -1, cv2.LINE_AA)
     _write(panel, "start", (width - 160, 18))
     if lost.any():

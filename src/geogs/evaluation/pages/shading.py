@@ -95,12 +95,15 @@ def _barycentric(
 
 
 def viewpoints(
-    vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], camera: Camera
+    vertices: Float[np.ndarray, "n 3"],
+    T_wc: Float[np.ndarray, "k 4 4"],
+    camera: Camera,
+    up: Float[np.ndarray, "3"] | None = None,
 ) -> list[Viewpoint]:
     """Views from the first and the middle camera, and from above without the ceiling.
 
     If all cameras look at one point, as at an object, the third is the camera with the largest
-    rotation from the other two.
+    rotation from the other two. ``up`` of the world is the cameras' where it is not given.
     """
     inside = camera.with_long_edge(_WIDTH)
     chosen = {"first frame": T_wc[0], "middle frame": T_wc[len(T_wc) // 2]}
@@ -109,14 +112,19 @@ def viewpoints(
         cosine = T_wc[:, :3, 2] @ T_wc[[0, len(T_wc) // 2], :3, 2].T
         chosen["another side"] = T_wc[cosine.max(1).argmin()]
     views = [Viewpoint(name, inside, np.linalg.inv(T)) for name, T in chosen.items()]
-    return views if around else [*views, _from_above(vertices, T_wc, _WIDTH, inside.height)]
+    if around:
+        return views
+    return [*views, _from_above(vertices, T_wc, level_axes(T_wc, up), _WIDTH, inside.height)]
 
 
 def _from_above(
-    vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], width: int, height: int
+    vertices: Float[np.ndarray, "n 3"],
+    T_wc: Float[np.ndarray, "k 4 4"],
+    axes: Float[np.ndarray, "3 3"],
+    width: int,
+    height: int,
 ) -> Viewpoint:
     """View with nearly parallel rays from far above; all above the cameras is cut away."""
-    axes = level_axes(T_wc)
     local = vertices.astype(np.float64) @ axes.T
     low, high = np.quantile(local, [0.005, 0.995], axis=0)
     extent = np.maximum(high - low, 1e-6)

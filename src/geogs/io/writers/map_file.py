@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -180,6 +180,12 @@ class MapViews(ShortRepr):
     """Whether a keyframe has a mask, in ``keyframes/``."""
     has_images: bool
     """Whether the images are kept, in ``keyframes/``."""
+
+    def rotated(self, R: Float64[np.ndarray, "3 3"]) -> "MapViews":
+        """The same views in a world that ``R`` maps this one to."""
+        T_cw = self.T_cw.copy()
+        T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.T
+        return replace(self, origin=R @ self.origin, disks=self.disks.rotated(R), T_cw=T_cw)
 
 
 def save_map_with_views(
