@@ -28,8 +28,8 @@ def test_the_ending_says_what_file_is_written(tmp_path):
         np.testing.assert_array_equal(getattr(again, part), getattr(mesh, part))
     assert (tmp_path / "mesh.GLB").read_bytes()[:4] == b"glTF"
     assert (tmp_path / "mesh.obj").read_text().count("vn ") == 4
-    with pytest.raises(InputError, match=r"should end in \.ply, \.glb or \.obj"):
-        mesh.save(tmp_path / "mesh.stl")
+    with pytest.raises(InputError, match=r"should end in \.ply, \.glb, \.obj, \.usdz or \.stl"):
+        mesh.save(tmp_path / "mesh.fbx")
 
 
 def test_trimesh_has_the_same_or_is_said_to_be_missing(monkeypatch):

@@ -12,7 +12,7 @@ from geogs.config.setting import Basic, Count, Port, Positional, Positive, Range
 
 Format = Literal[
     "colmap", "nerfstudio", "gsplat", "cloud", "depth", "normals", "kitti", "euroc", "tum", "glb",
-    "obj", "splats",
+    "obj", "splats", "stl", "usdz", "plan", "section",
 ]  # fmt: skip
 
 HERE = "127.0.0.1"
@@ -24,7 +24,8 @@ class ExportSettings(Settings):
     """Write a result in the format of another program; docs/formats.md says how each is laid out.
 
     Image sets: colmap, nerfstudio, depth, normals. Paths of the camera: kitti, euroc, tum.
-    Surfaces: glb, obj, cloud (PLY, LAS). Splats: splats (3DGS and 2DGS), gsplat (start values).
+    Surfaces: glb, usdz (phones), obj, stl, cloud (PLY, LAS). Drawings: plan, section (SVG, PDF,
+    DXF). Splats: splats (3DGS and 2DGS), gsplat (start values).
     """
 
     result: Annotated[Path, Positional()]
@@ -33,16 +34,23 @@ class ExportSettings(Settings):
     """What to write; docs/formats.md says how each format is laid out."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder or file; export/FORMAT in the folder of the result if none is given. A cloud that ends
-    in .las becomes LAS, else PLY."""
+    in .las becomes LAS, else PLY; a drawing that ends in .svg, .pdf or .dxf is written as that
+    alone."""
     as_tracked: bool = False
     """Keep the axes of the run, or of the poses that were given, instead of standing upright."""
     text: bool = False
     """Write a COLMAP model as text, which is binary otherwise."""
     points: Annotated[int, Range(100, 10_000_000)] = 50_000
     """Points with tracks to look for in colmap and nerfstudio."""
-    textured: bool = False
-    """Give a glb an image of its surface, put together from the keyframes' images, instead of
-    vertex colours."""
+    crop: str = ""
+    """Part of a surface, a drawing or of splats: x0,y0,z0,x1,y1,z1 (a box: right, forward, up), or
+    near:DISTANCE (from the camera's path)."""
+    cut: float | None = None
+    """Where a drawing is cut: a plan's height over the floor, by default 1.2 m, or a third of the
+    height where metres are not known; a section's distance in front of the middle of the path."""
+    textured: bool = True
+    """Give a glb or usdz an image of its surface, put together from the keyframes' images, if they
+    were kept, instead of vertex colours."""
     texture_size: Annotated[int, Range(64, 16384)] = 4096
     """Longest side of that image, pixels; it is no larger than the keyframes' images call for."""
     sh_degree: Annotated[int, Range(0, 4)] = 3

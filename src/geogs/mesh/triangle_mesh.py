@@ -79,15 +79,17 @@ class Mesh:
         return Mesh(self.vertices[origin], faces, normals, colours)
 
     def save(self, path: str | Path) -> None:
-        """Write a file that ends in .ply, .glb or .obj. The latter two have y up; GLB, which is
-        for viewing, has a vertex for each side of a sharp edge.
+        """Write a file that ends in .ply, .glb, .obj, .usdz or .stl. In GLB, OBJ and USDZ y is up,
+        in STL z, if y is down here; GLB and USDZ, which are for viewing, have a vertex for each
+        side of a sharp edge.
 
         Raises:
             InputError: it ends otherwise.
             OutputError: it cannot be written.
         """
         from geogs.io.writers.atomic import atomic_file
-        from geogs.io.writers.exports.mesh_writers import glb, write_obj
+        from geogs.io.writers.exports.mesh_writers import glb, write_obj, write_stl
+        from geogs.io.writers.exports.usdz_writer import write_usdz
         from geogs.io.writers.ply_writer import write_mesh
 
         path = expanded(path)
@@ -100,8 +102,13 @@ class Mesh:
                     stream.write(glb(mesh.vertices, mesh.faces, mesh.normals, mesh.colours))
             case ".obj":
                 write_obj(path, self.vertices, self.faces, self.normals, self.colours)
+            case ".stl":
+                write_stl(path, self.vertices, self.faces)
+            case ".usdz":
+                mesh = self.creased()
+                write_usdz(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
             case _:
-                raise InputError(f"{path} should end in .ply, .glb or .obj.")
+                raise InputError(f"{path} should end in .ply, .glb, .obj, .usdz or .stl.")
 
     def to_trimesh(self) -> "trimesh.Trimesh":
         """The mesh for trimesh. Raises InputError if that is not installed."""

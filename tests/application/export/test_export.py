@@ -33,7 +33,7 @@ def result(tmp_path_factory) -> SavedResult:
 
 
 def exported(result: SavedResult, to: str, **more: object) -> Path:
-    more = {"as_tracked": True, **more}
+    more = {"as_tracked": True, "textured": False, **more}
     return export(ExportSettings(result.folder, to, device="cpu", **more))
 
 

@@ -8,42 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import geogs
-from box_room import box, circle
 from geogs.application.export.export import export
 from geogs.application.result_settings import ExportSettings
 from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_poses
-from geogs.io.writers.trajectories import write_tum_trajectory
-from geogs.mesh.triangle_mesh import Mesh
-from geogs.types import Trajectory
-from saved_results import make_result
+from tilted_room import make_room
 
 TILTS = [(0, 0, 0), (90, 0, 0), (70, -40, 20), (-100, 10, 170), (15, 0, -12)]
 """Rotations of the rooms' worlds, whose own up is z."""
-
-
-def make_room(folder: Path, turn: Rotation, noise: float = 0.004) -> Path:
-    """A result whose mesh is a box with noise and whose cameras are tilted, in a turned world."""
-    make_result(folder)
-    vertices, faces = box((3.0, 2.0, 1.2))
-    for _ in range(6):  # each triangle becomes four
-        corners = vertices[faces]
-        middles = (corners + np.roll(corners, -1, 1)) / 2
-        a, b, c = corners.transpose(1, 0, 2)
-        d, e, f = middles.transpose(1, 0, 2)
-        vertices = np.stack([a, d, f, d, b, e, f, e, c, d, e, f], 1).reshape(-1, 3)
-        vertices, back = np.unique(vertices.round(9), axis=0, return_inverse=True)
-        faces = back.reshape(-1, 3)
-    vertices += np.random.default_rng(0).normal(0, noise, vertices.shape)
-    Mesh.from_triangles(turn.apply(vertices), faces).save(folder / "mesh.ply")
-    T_wc = circle()
-    T_wc[:, :3, :3] = turn.as_matrix() @ T_wc[:, :3, :3] @ Rotation.from_euler(
-        "xz", [-20, 8], degrees=True
-    ).as_matrix()  # fmt: skip
-    T_wc[:, :3, 3] = turn.apply(T_wc[:, :3, 3])
-    path = Trajectory(np.arange(len(T_wc)) / 30, T_wc, np.ones(len(T_wc), bool))
-    write_tum_trajectory(folder / "trajectory.tum", path)
-    return folder
 
 
 @pytest.fixture(scope="module", params=TILTS)

@@ -10,19 +10,26 @@ from geogs.application.export.image_sets import (
     write_map_set,
     write_nerfstudio_set,
 )
+from geogs.application.export.part import Part
+from geogs.application.export.plan import draw_cut
+from geogs.application.export.region import read_region
 from geogs.application.export.seen_points import cloud
 from geogs.application.result_settings import ExportSettings, Format
 from geogs.application.results.output_folder import claimed
-from geogs.application.results.saved_result import SavedResult, load_result
+from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views, splat_colours
+from geogs.application.results.upright import tracked_poses
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.writers.exports.gsplat import write_gsplat_start
 from geogs.io.writers.exports.las import write_las
+from geogs.io.writers.exports.line_drawing import write_drawing
 from geogs.io.writers.exports.mesh_writers import write_textured_glb
+from geogs.io.writers.exports.usdz_writer import write_usdz
 from geogs.io.writers.ply_writer import write_points, write_splats
 from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_euroc, write_kitti, write_tum_trajectory
+from geogs.mesh.decimation.decimate import with_at_most
 from geogs.mesh.texture.textured import texture_mesh
 from geogs.mesh.triangle_mesh import median_edge
 from geogs.threads import on_one_torch_thread
@@ -34,14 +41,24 @@ _FILES: dict[Format, tuple[str, ...]] = {
     "gsplat": ("start.npz", ".npz"),
     "kitti": ("poses.txt", ".txt"),
     "obj": ("mesh.obj", ".obj"),
+    "plan": ("plan.svg", ".svg", ".pdf", ".dxf"),
+    "section": ("section.svg", ".svg", ".pdf", ".dxf"),
+    "stl": ("mesh.stl", ".stl"),
     "tum": ("trajectory.txt", ".txt", ".tum"),
+    "usdz": ("mesh.usdz", ".usdz"),
 }
 """Formats of a single file: its default name, and the allowed endings."""
-_Y_DOWN = frozenset({"colmap", "kitti", "gsplat", "splats", "glb", "obj"})
-"""Formats of worlds with y down, which viewers of COLMAP and of splats expect, and which the writers
-of meshes turn to y up; others have z up."""
-_SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
+_Y_DOWN = frozenset({"colmap", "kitti", "gsplat", "splats", "glb", "obj", "stl", "usdz"})
+"""Formats of worlds with y down, which viewers of COLMAP and of splats expect, and which writers of
+meshes turn to y or z up; others have z up."""
+_NOT_CROPPED = frozenset({"colmap", "nerfstudio", "depth", "normals", "kitti", "euroc", "tum"})
+"""Formats of images and of the camera's path, of which no part is cut out."""
+_SUFFIXES = frozenset(
+    {suffix for _, *suffixes in _FILES.values() for suffix in suffixes} | {".laz"}
+)
 """Endings of files; a folder has none of these."""
+MOST_ON_PHONES = 200_000
+"""Most triangles of a USDZ, which phones show without delay."""
 
 
 @on_one_torch_thread
@@ -54,27 +71,35 @@ def export(settings: ExportSettings) -> Path:
         DeviceError: the device cannot be used.
     """
     to = settings.to
+    region = read_region(settings.crop)
+    if region is not None and to in _NOT_CROPPED:
+        raise InputError(f"--crop cuts surfaces, drawings and splats, not {to}; leave it out.")
     result = load_result(settings.result, require_device(settings.device))
+    axes = np.eye(3)
     if not settings.as_tracked:
-        stands = result.upright
-        result = result.rotated(stands.y_down if to in _Y_DOWN else stands.axes)
+        axes = result.upright.axes
+        R = result.upright.y_down if to in _Y_DOWN else axes
+        result = result.rotated(R)
+        axes = axes @ R.T
+    part = Part(result, region, axes)
     place = settings.output or result.folder / "export" / settings.to
     name, *suffixes = _FILES.get(to, (to,))
-    if to == "glb" and settings.textured:  # beside the plain one
+    if to == "glb" and settings.textured and result.views.has_images:  # beside the plain one
         name = "mesh_textured.glb"
     path = _file(place, name, *suffixes) if to in _FILES else place
     if path == settings.output and to in _FILES and to != "kitti":  # of two files
-        _write(path, result, settings)
+        _write(path, part, settings)
         return path
     # Existing content of the user's folder, or of the result's, is not trusted.
     folder = result.folder if settings.output is None else path if to not in _FILES else path.parent
     with claimed(folder) as output, replaced(output, "beside") as new:
-        _write(new / path.relative_to(folder), result, settings)
+        _write(new / path.relative_to(folder), part, settings)
     return path
 
 
-def _write(path: Path, result: SavedResult, settings: ExportSettings) -> None:
+def _write(path: Path, part: Part, settings: ExportSettings) -> None:
     """Write an export to a file or into a folder."""
+    result = part.result
     match settings.to:
         case "colmap":
             write_colmap_set(path, result, settings.points, settings.text)
@@ -83,21 +108,26 @@ def _write(path: Path, result: SavedResult, settings: ExportSettings) -> None:
         case "depth" | "normals":
             write_map_set(path, result, settings.to)
         case "gsplat":
-            write_gsplat_start(path, result.disks, _disk_colours(result))
+            write_gsplat_start(path, part.disks, _disk_colours(part))
         case "splats":
-            colours = _disk_colours(result)
+            colours = _disk_colours(part)
             for name, is_flat in (("splats_3dgs.ply", False), ("splats_2dgs.ply", True)):
-                write_splats(path / name, result.disks, colours, is_flat, settings.sh_degree)
+                write_splats(path / name, part.disks, colours, is_flat, settings.sh_degree)
         case "cloud":
-            _write_cloud(path, result)
+            _write_cloud(path, part)
         case "kitti":
             write_kitti(path, result.trajectory.of("tracked"))
         case "euroc":
             write_euroc(path, result.trajectory.of("tracked"))
         case "tum":
             write_tum_trajectory(path, result.trajectory.of("tracked"))
-        case "glb" | "obj":
-            _write_mesh(path, result, settings)
+        case "plan" | "section":
+            cameras = tracked_poses(result.trajectory)[:, :3, 3]
+            drawing = draw_cut(part.mesh, settings.to, settings.cut, part.lengths, cameras)
+            for suffix in (path.suffix,) if path == settings.output else _FILES[settings.to][1:]:
+                write_drawing(path.with_suffix(suffix), drawing)
+        case "glb" | "obj" | "stl" | "usdz":
+            _write_mesh(path, part, settings)
 
 
 def _file(place: Path, name: str, *suffixes: str) -> Path:
@@ -111,32 +141,37 @@ def _file(place: Path, name: str, *suffixes: str) -> Path:
     return place if place.suffix.lower() in suffixes else place / name
 
 
-def _disk_colours(result: SavedResult) -> Float[np.ndarray, "n 3"]:
+def _disk_colours(part: Part) -> Float[np.ndarray, "n 3"]:
     """RGB in [0, 1] of the disks. Raises InputError if the result has no images."""
-    result.require_images()
-    return splat_colours(result.disks, fusion_views(result.renders))
+    part.result.require_images()
+    return splat_colours(part.disks, fusion_views(part.result.renders))
 
 
-def _write_cloud(path: Path, result: SavedResult) -> None:
+def _write_cloud(path: Path, part: Part) -> None:
     """Write the surface as points, by the ending of the path as LAS or PLY."""
-    positions, normals, colours = cloud(result.renders)
+    positions, normals, colours = cloud(part.result.renders)
+    kept = part.holds(positions)
     if path.suffix.lower() == ".las":
-        write_las(path, positions, colours)
+        write_las(path, positions[kept], colours[kept])
     else:
-        write_points(path, positions, colours, normals)
+        write_points(path, positions[kept], colours[kept], normals[kept])
 
 
-def _write_mesh(path: Path, result: SavedResult, settings: ExportSettings) -> None:
-    """Write the mesh of the result unchanged, or textured by the keyframes' images."""
-    mesh = result.mesh
-    if mesh is None:
-        raise InputError(f"{result.folder} has no mesh.ply; geogs mesh {result.folder} makes it.")
-    if settings.to == "obj" or not settings.textured:
+def _write_mesh(path: Path, part: Part, settings: ExportSettings) -> None:
+    """Write the mesh of the result, where asked textured by the keyframes' images."""
+    mesh = part.mesh
+    to = settings.to
+    if to == "usdz" and len(mesh.faces) > MOST_ON_PHONES:
+        mesh = with_at_most(mesh, MOST_ON_PHONES)
+    if to in ("obj", "stl") or not (settings.textured and part.result.views.has_images):
         mesh.save(path)
-    else:
-        result.require_images()
-        views = fusion_views(result.renders)
-        # Largest distance of a face from a depth map that shows it, in median mesh edges.
-        tolerance = 2.0 * median_edge(mesh)
-        m = texture_mesh(mesh, views, tolerance, settings.texture_size)
+        return
+    views = fusion_views(part.result.renders)
+    # Largest distance of a face from a depth map that shows it, in median mesh edges.
+    tolerance = 2.0 * median_edge(mesh)
+    m = texture_mesh(mesh, views, tolerance, settings.texture_size)
+    if to == "glb":
         write_textured_glb(path, m.vertices, m.faces, m.normals, m.uv, m.texture)
+    else:
+        metres = part.lengths.metres or 1.0
+        write_usdz(path, m.vertices, m.faces, m.normals, (m.uv, m.texture), metres)

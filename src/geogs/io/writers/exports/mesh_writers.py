@@ -169,10 +169,11 @@ def write_textured_glb(
     attributes["TEXCOORD_0"] = gltf.add((uv + 0.5) / size, "VEC2")
     corners = gltf.add_corners(faces)
     with atomic_file(path) as stream:
-        stream.write(gltf.packed(attributes, corners, gltf.textured(_jpeg(texture))))
+        stream.write(gltf.packed(attributes, corners, gltf.textured(encoded_jpeg(texture))))
 
 
-def _jpeg(texture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+def encoded_jpeg(texture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """A texture as JPEG."""
     options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     _, data = cv2.imencode(".jpg", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), options)
     return data.tobytes()
@@ -195,6 +196,19 @@ def write_obj(
     lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (faces + 1).tolist()]
     with atomic_file(path) as stream:
         stream.write(("\n".join(lines) + "\n").encode())
+
+
+def write_stl(
+    path: Path, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+) -> None:
+    """Write binary STL with z up, for printers and CAD: no colours, and no unit."""
+    corners = vertices.astype(np.float64)[faces] @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    rows = np.zeros(len(faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    rows["normal"] = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    rows["corners"] = corners
+    with atomic_file(path) as stream:
+        stream.write(b"geogs".ljust(80) + struct.pack("<I", len(faces)) + rows.tobytes())
 
 
 def linear(colours: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -1,0 +1,1 @@
+"""Line drawings of a mesh: plans and sections."""
