@@ -1,13 +1,17 @@
 """The system as Python programs use it."""
 
+import json
+import re
 import threading
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 import geogs
+from geogs.cli.main import main
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.trajectory_errors import evaluate_trajectory
@@ -94,6 +98,34 @@ def test_another_video_is_found_in_a_saved_map(first, small_room):
     assert all(torch.equal(slam.world.keyframes[i].T_cw, T) for i, T in held.items())
     assert len(slam.snapshot()) > 0.7 * before
     assert len(slam.uncertainty().position) == trajectory.tracked.sum() > 0
+
+
+@pytest.mark.system
+def test_photographs_are_located_in_a_saved_map(first, small_room, tmp_path, capsys):
+    _, _, folder = first
+    truth = np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4)
+    former = read_tum_trajectory(folder / "trajectory.tum")
+    scale, R, t = umeyama(*map(torch.from_numpy, (former.T_wc[:, :3, 3], truth[:FIRST, :3, 3])))
+    for number in (4, FIRST - 2):
+        photo = next(small_room.glob(f"**/frame{number:06d}.*"))
+        arguments = ["locate", str(photo), "--map", str(folder), "-o", str(tmp_path)]
+        assert main([*arguments, "--device", "cpu"]) == 0
+        said = capsys.readouterr().out
+        assert "Near keyframe" in said
+        row = [float(n) for n in re.search(r"qw: (.*)", said)[1].split()]
+        at = (scale * R @ torch.tensor(row[:3], dtype=torch.float64) + t).numpy()
+        assert 100 * np.linalg.norm(at - truth[number, :3, 3]) < 3
+        document = json.loads((tmp_path / f"{photo.stem}.json").read_text())
+        np.testing.assert_allclose(np.array(document["T_wc"])[:3, 3], row[:3], rtol=1e-4)
+        assert 0 < document["sigma_position"] < 0.1
+        assert document["nearest"][0]["distance"] < 0.2
+        assert cv2.imread(str(tmp_path / f"{photo.stem}.png")).shape[1] > 1200
+    noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
+    arguments = ["locate", str(tmp_path / "noise.png"), "--map", str(folder), "--device", "cpu"]
+    assert main(arguments) == 2
+    assert "was not found" in capsys.readouterr().err
+    assert not (folder / "located").exists()
 
 
 @pytest.mark.system

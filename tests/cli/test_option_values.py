@@ -6,7 +6,19 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from geogs.cli import demo, doctor, download, eval, export, mesh, reconstruct, run, scale, view
+from geogs.cli import (
+    demo,
+    doctor,
+    download,
+    eval,
+    export,
+    locate,
+    mesh,
+    reconstruct,
+    run,
+    scale,
+    view,
+)
 from geogs.cli.options import parse_options
 from geogs.config.leaves import Leaf, leaves
 from geogs.config.setting import Positional
@@ -32,6 +44,8 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
     "eval": (eval.EvalSettings, plain(eval.EvalSettings, "eval"), ["out", "--gt", "truth"]),
     "export": (export.ExportSettings, plain(export.ExportSettings, "export"),
                ["out", "--to", "tum"]),
+    "locate": (locate.LocateSettings, plain(locate.LocateSettings, "locate"),
+               ["a.jpg", "--map", "out"]),
     "mesh": (mesh.RemeshSettings, plain(mesh.RemeshSettings, "mesh"), ["out"]),
     "scale": (scale.RescaleSettings, plain(scale.RescaleSettings, "scale"), ["out"]),
     "synth": (synth.SynthOptions, lambda argv: parse_options(

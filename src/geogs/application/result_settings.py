@@ -97,6 +97,27 @@ class RescaleSettings(Settings):
 
 
 @dataclass(frozen=True)
+class LocateSettings(Settings):
+    """Find where a photograph was taken, in the map of a result of the same camera.
+
+    Prints its pose, the standard deviation and the nearest keyframes; a picture shows it beside the
+    map from there.
+    """
+
+    photo: Annotated[Path, Positional()]
+    """The photograph."""
+    map: Annotated[Path, Basic()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    intrinsics: Annotated[str, Basic()] = "auto"
+    """Lens of the photograph, as geogs run takes it; auto is that of the result."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the picture and the pose as JSON; located/ in the folder of the result if none is
+    given."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+@dataclass(frozen=True)
 class ViewSettings(Settings):
     """Look at a result in the browser: mesh, disks, path, keyframes with depth and normals.
 

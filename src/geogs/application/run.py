@@ -1,8 +1,10 @@
 """A run, from the paths of its videos or from a checkpoint to the files of its result."""
 
 import math
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from geogs.application.calibrate import self_calibrated, without_overlay
@@ -25,7 +27,7 @@ from geogs.application.slam_in_python import go_on_in, new_slam
 from geogs.application.structure_from_motion.fallback import TrackedOrPlaced
 from geogs.application.tracked_video import TrackedVideo
 from geogs.application.viewer.observer import RunObserver
-from geogs.config import Config
+from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
 from geogs.errors import InputError, TrackingLost
 from geogs.gpu.installation import require_device
@@ -134,12 +136,19 @@ def _metadata(settings: RunSettings, driver: Driver, opened: Source, source: Sou
 def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
     """Open the sources; to continue a map with an estimated lens, in its keyframes' pinhole."""
     given = settings.config.input
-    if base is None or given.intrinsics.strip().lower() != "auto":
+    if base is None:
         return open_source(settings.source, given)
+    return opened_in(base, given, partial(open_source, settings.source))
+
+
+def opened_in(
+    base: SavedResult, given: InputConfig, opener: Callable[[InputConfig], Source]
+) -> Source:
+    """Open a source in the pinhole of a map's keyframes, if its lens is not given."""
     known = base.folder / "intrinsics.json"
-    if not known.is_file():
-        return open_source(settings.source, given)
-    opened = open_source(settings.source, replace(given, intrinsics=str(known)))
+    if given.intrinsics.strip().lower() != "auto" or not known.is_file():
+        return opener(given)
+    opened = opener(replace(given, intrinsics=str(known)))
     focal = base.camera.fx
     is_same = math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
     return opened if is_same or given.working_field_of_view != "auto" else opened.with_focal(focal)

@@ -38,6 +38,7 @@ COMMANDS = {
     "mesh": Command("geogs.cli.mesh", "make the mesh of a result anew, without running again"),
     "scale": Command("geogs.cli.scale", "bring a result to metres by a length that is known"),
     "export": Command("geogs.cli.export", "write a result in the formats of other programs"),
+    "locate": Command("geogs.cli.locate", "find where a photograph was taken, in a result's map"),
     "view": Command("geogs.cli.view", "look at a result in the browser"),
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
     "download": Command("geogs.cli.download", "fetch a public sequence, or list those known"),

@@ -16,6 +16,7 @@ from geogs.application.export.region import read_region
 from geogs.application.export.seen_points import cloud
 from geogs.application.result_settings import ExportSettings, Format
 from geogs.application.results.output_folder import claimed
+from geogs.application.results.result_page import result_lengths
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.application.results.upright import tracked_poses
@@ -123,7 +124,9 @@ def _write(path: Path, part: Part, settings: ExportSettings) -> None:
             write_tum_trajectory(path, result.trajectory.of("tracked"))
         case "plan" | "section":
             cameras = tracked_poses(result.trajectory)[:, :3, 3]
-            drawing = draw_cut(part.mesh, settings.to, settings.cut, part.lengths, cameras)
+            drawing = draw_cut(
+                part.mesh, settings.to, settings.cut, result_lengths(result), cameras
+            )
             for suffix in (path.suffix,) if path == settings.output else _FILES[settings.to][1:]:
                 write_drawing(path.with_suffix(suffix), drawing)
         case "glb" | "obj" | "stl" | "usdz":
@@ -173,5 +176,5 @@ def _write_mesh(path: Path, part: Part, settings: ExportSettings) -> None:
     if to == "glb":
         write_textured_glb(path, m.vertices, m.faces, m.normals, m.uv, m.texture)
     else:
-        metres = part.lengths.metres or 1.0
+        metres = result_lengths(part.result).metres or 1.0
         write_usdz(path, m.vertices, m.faces, m.normals, (m.uv, m.texture), metres)

@@ -10,8 +10,6 @@ from geogs.application.export.region import Region
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.upright import tracked_poses
 from geogs.errors import InputError
-from geogs.evaluation.model_view.shown_model import Lengths
-from geogs.evaluation.pages.run_page import lengths
 from geogs.mesh.clean import keep_faces
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
@@ -54,9 +52,3 @@ class Part:
         disks = self.result.disks
         kept = self.holds(disks.position.cpu().numpy())
         return replace(disks, **{name: getattr(disks, name)[kept] for name in disks.__slots__})
-
-    @property
-    def lengths(self) -> Lengths:
-        """Unit of length of the result; unknown where it has no summary."""
-        has_summary = (self.result.folder / "summary.json").is_file()
-        return lengths(self.result.summary) if has_summary else Lengths()

@@ -131,6 +131,12 @@ def _write_with_path(
     write_run_page(folder, summary, model)
 
 
+def result_lengths(result: SavedResult) -> Lengths:
+    """Unit of length of a saved result; unknown where it has no summary."""
+    has_summary = (result.folder / "summary.json").is_file()
+    return lengths(result.summary) if has_summary else Lengths()
+
+
 def shown_views(result: SavedResult) -> list[ShownView]:
     """The keyframes of a saved result; images are read on demand."""
     views = result.views

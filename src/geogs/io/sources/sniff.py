@@ -7,7 +7,7 @@ from pathlib import Path
 
 from geogs.config import InputConfig
 from geogs.config.arguments import checks_arguments
-from geogs.documents import expanded
+from geogs.documents import expanded, require_file
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress, live_address
 from geogs.io.sources.formats import (
@@ -25,12 +25,14 @@ from geogs.io.sources.formats import (
 )
 from geogs.io.sources.formats.image_files import (
     SUFFIXES,
+    ImageFile,
     ImageList,
     image_folder,
     open_image_folder,
 )
 from geogs.io.sources.formats.model_layouts import open_posed_photographs, place_of_model
 from geogs.io.sources.frame_source import Source
+from geogs.io.sources.known_intrinsics import calibration_from_exif
 from geogs.io.sources.known_layouts import LAYOUTS, WITH_MODEL
 from geogs.io.sources.layouts import found_below, found_in, what_is_missing
 from geogs.io.sources.posed.posed_set import PosedSet
@@ -101,6 +103,18 @@ def open_source(
         for one, address in zip(paths, addresses, strict=True)
     )
     return Source([WorkingImages(reader, config) for reader in readers])
+
+
+def open_picture(path: Path, config: InputConfig) -> Source:
+    """Open a single picture as a source of one frame.
+
+    Raises:
+        InputError: it cannot be read, or ``config`` does not fit it.
+    """
+    path = require_file(expanded(path))
+    calibration = calibration_from_exif(path)
+    picture = ImageList("picture", path.name, [ImageFile(path, 0.0)], calibration)
+    return Source([WorkingImages(picture, config)])
 
 
 def _live_reader(address: LiveAddress, config: InputConfig) -> Reader:

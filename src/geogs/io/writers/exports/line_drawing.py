@@ -118,7 +118,8 @@ def _dxf(drawing: LineDrawing) -> str:
             [(0, "TEXT"), (8, "LENGTHS"), (10, x), (20, y), (30, 0.0), (40, height), (1, text),
              (50, angle), (72, 1), (11, x), (21, y), (31, 0.0), (73, 2)]
         )  # fmt: skip
-    groups = [(0, "SECTION"), (2, "HEADER"), (9, "$ACADVER"), (1, "AC1009"), (0, "ENDSEC")]
+    groups: list[tuple[int, str | float]] = [(0, "SECTION"), (2, "HEADER"), (9, "$ACADVER")]
+    groups += [(1, "AC1009"), (0, "ENDSEC")]
     groups += [(0, "SECTION"), (2, "ENTITIES")]
     groups += [group for entity in entities for group in entity]
     groups += [(0, "ENDSEC"), (0, "EOF")]
@@ -126,5 +127,7 @@ def _dxf(drawing: LineDrawing) -> str:
 
 
 def _line(layer: str, start: list[float], end: list[float]) -> list[tuple[int, str | float]]:
-    places = [(10, start[0]), (20, start[1]), (30, 0.0), (11, end[0]), (21, end[1]), (31, 0.0)]
-    return [(0, "LINE"), (8, layer), *((code, round(value, 6)) for code, value in places)]
+    (x, y), (u, v) = start, end
+    places = [(10, x), (20, y), (30, 0.0), (11, u), (21, v), (31, 0.0)]
+    rounded: list[tuple[int, str | float]] = [(code, round(value, 6)) for code, value in places]
+    return [(0, "LINE"), (8, layer), *rounded]
