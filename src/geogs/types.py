@@ -344,6 +344,10 @@ class MapSnapshot:
         position = self.position * unit + torch.from_numpy(origin).to(self.position)
         return MapSnapshot(position, self.quaternion, self.scale * unit, self.opacity)
 
+    def scaled(self, factor: float) -> "MapSnapshot":
+        """Return the disks with all lengths multiplied."""
+        return replace(self, position=factor * self.position, scale=factor * self.scale)
+
     def rotated(self, R: Float64[np.ndarray, "3 3"]) -> "MapSnapshot":
         """Return the disks in a world that ``R`` maps this one to."""
         rotation = torch.from_numpy(R)

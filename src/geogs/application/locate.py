@@ -113,14 +113,12 @@ def locate(settings: LocateSettings) -> Located:
             "shows; take one nearer to a keyframe, of the same camera."
         )
     nearest = near_keyframes(pose.T_cw, base)
-    folder = settings.output or base.folder / "located"
     name = f"{settings.photo.stem}.png"
-    located = Located(pose, nearest, folder / name, result_lengths(base).name)
-    with claimed(settings.output or base.folder) as output, replaced(output, "beside") as new:
-        picture = new / (folder / name).relative_to(output)
-        _draw(picture, frame, pose.T_cw, base, nearest[0].number)
+    located = Located(pose, nearest, settings.output / name, result_lengths(base).name)
+    with claimed(settings.output) as output, replaced(output, "beside") as new:
+        _draw(new / name, frame, pose.T_cw, base, nearest[0].number)
         document = json.dumps(located.as_dict(), indent=2) + "\n"
-        write_text(picture.with_suffix(".json"), document)
+        write_text((new / name).with_suffix(".json"), document)
     return located
 
 

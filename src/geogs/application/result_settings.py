@@ -3,7 +3,7 @@
 This module imports only the settings, so that a command line can be read at once.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -59,6 +59,13 @@ class ExportSettings(Settings):
     device: str = "auto"
     """Where to render: auto (a GPU where there is one), cpu, cuda or cuda:1."""
 
+    def scaled(self, factor: float) -> "ExportSettings":
+        """The same export of a result whose lengths were multiplied."""
+        word, colon, numbers = self.crop.rpartition(":")
+        cropped = ",".join(f"{factor * float(n):.9g}" for n in numbers.split(",") if n)
+        cut = None if self.cut is None else factor * self.cut
+        return replace(self, crop=word + colon + cropped, cut=cut)
+
 
 @dataclass(frozen=True)
 class RemeshSettings(Settings):
@@ -82,8 +89,8 @@ class RemeshSettings(Settings):
 class RescaleSettings(Settings):
     """Bring a result to metres by something whose length is known.
 
-    Trajectories, map, splats, meshes and summary are written in metres; exports are made anew by
-    geogs export.
+    Trajectories, map, splats, meshes, summary, page and exports in its folder are made anew, in
+    metres; an evaluation is deleted.
     """
 
     result: Annotated[Path, Positional()]
@@ -110,9 +117,8 @@ class LocateSettings(Settings):
     """Folder of a result, as geogs run and geogs reconstruct write it."""
     intrinsics: Annotated[str, Basic()] = "auto"
     """Lens of the photograph, as geogs run takes it; auto is that of the result."""
-    output: Annotated[Path | None, Basic("-o")] = None
-    """Folder for the picture and the pose as JSON; located/ in the folder of the result if none is
-    given."""
+    output: Annotated[Path, Basic("-o")] = Path("located")
+    """Folder for the picture and the pose as JSON."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
 

@@ -12,7 +12,7 @@ def main(argv: Sequence[str]) -> Answer:
     """Run the command; returns its answer."""
     options = parse_options(RescaleSettings, argv, "scale")
 
-    from geogs.application.results.revise import rescale
+    from geogs.application.rescale import rescale
     from geogs.application.scale.measurable_scene import scale_sentence
 
     found = rescale(options)

@@ -14,6 +14,7 @@ import torch
 
 import geogs
 from disk_faults import contents, every_fault, full_disk, kill
+from geogs.application import rescale
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.evaluate import evaluate
@@ -125,7 +126,7 @@ def quick(monkeypatch) -> None:
     surface = Mesh(MESH.vertices + 1, MESH.faces, MESH.normals)
     monkeypatch.setattr(surfaces, "extract_mesh", lambda *_: surface)
     found = MetricScale("a known distance", FACTOR, 0.01)
-    monkeypatch.setattr(revise, "find_scale", lambda *_: found)
+    monkeypatch.setattr(rescale, "find_scale", lambda *_: found)
     for module in ("run_page", "evaluation_page"):
         monkeypatch.setattr(
             f"geogs.evaluation.pages.{module}.model_section", lambda model: ("", ())
@@ -160,7 +161,7 @@ def commands(made, tmp_path) -> dict[str, Callable[[Path], object]]:
     return {
         "run": a_run(SavedScene(load_result(made)), images),
         "mesh": lambda folder: revise.remesh(RemeshSettings(folder, MeshConfig(), device="cpu")),
-        "scale": lambda folder: revise.rescale(RescaleSettings(folder, "height:1.6", "cpu")),
+        "scale": lambda folder: rescale.rescale(RescaleSettings(folder, "height:1.6", "cpu")),
         "eval": lambda folder: evaluate(
             EvalSettings(folder, truth, surface=False, alignment="none", plots=False)
         ),

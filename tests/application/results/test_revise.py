@@ -1,21 +1,27 @@
 """A saved result brought to metres, or given another mesh."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 import geogs
-from geogs.application.result_settings import RemeshSettings, RescaleSettings
-from geogs.application.results.revise import mesh_settings, remesh, rescale
+from geogs.application.export.export import EXPORTS, export
+from geogs.application.rescale import rescale
+from geogs.application.result_settings import ExportSettings, RemeshSettings, RescaleSettings
+from geogs.application.results.revise import mesh_settings, remesh
 from geogs.application.results.surfaces import fusion_views
 from geogs.cli.main import main
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.map_file import save_map
 from geogs.io.writers.ply_writer import write_splats
+from geogs.io.writers.replacement import replaced
 from geogs.mesh.extract import extract_mesh
 from saved_results import BLOCK, CAMERA, ORIGIN, UNIT, WALL, make_result
 
@@ -74,6 +80,73 @@ def test_every_length_is_multiplied(folder):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["metric_scale"]["factor"] == pytest.approx(found.factor, rel=1e-3)
     assert len(read_tum_trajectory(folder / "trajectory.tum").timestamps) == 5
+
+
+KNOWN = "0:8,6,70,52=13.8m"
+"""A length in the first frame, which about doubles all others."""
+WITHOUT_LENGTHS = re.compile(r"config.yaml|intrinsics.json|keyframes/.*|\.geogs.*")
+
+
+def test_nothing_of_the_old_unit_is_left(folder):
+    """Every file but those without lengths is written anew or gone."""
+    (folder / "report").mkdir()
+    with replaced(folder, "part") as new:
+        for name in ("eval.json", "report/mesh_truth.png", "report/trajectory.png"):
+            write_text(new / name, "old")
+        seconds = "snapshots/5"
+        (new / seconds).mkdir(parents=True)
+        save_map(new / seconds / "map.safetensors", geogs.load_result(folder).disks, {"seconds": 5})
+        geogs.load_result(folder).mesh.save(new / seconds / "mesh.ply")
+    more: dict[str, dict[str, object]] = {
+        "glb": {"textured": False},
+        "tum": {},
+        "stl": {"crop": "near:9"},
+        "cloud": {"as_tracked": True},
+        "section": {"cut": 5.0},
+    }
+    for to, options in more.items():
+        export(ExportSettings(folder, to, device="cpu", **options))
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    vertices = geogs.load_result(folder).mesh.vertices
+    cloud = np.ptp(read_ply(folder / "export/cloud/cloud.ply")["vertex"].columns["x"])
+    triangles = (folder / "export/stl/mesh.stl").stat().st_size
+    factor = rescale(RescaleSettings(folder, KNOWN, "cpu")).factor
+    assert factor == pytest.approx(2, rel=0.2)
+    same = [
+        str(path.relative_to(folder))
+        for path, data in before.items()
+        if path.is_file() and path.read_bytes() == data
+    ]
+    assert [name for name in same if not WITHOUT_LENGTHS.fullmatch(name)] == []
+    gone = {path.name for path in before if not path.is_file()}
+    assert gone == {"eval.json", "mesh_truth.png"}
+    after = read_ply(folder / "export/cloud/cloud.ply")["vertex"].columns["x"]
+    assert np.ptp(after) == pytest.approx(factor * cloud, rel=0.01)
+    assert (folder / "export/stl/mesh.stl").stat().st_size == triangles  # cropped as before
+    path = read_tum_trajectory(folder / "export/tum/trajectory.txt")
+    assert np.isclose(np.linalg.norm(path.T_wc[0, :3, 3]), factor * np.linalg.norm(ORIGIN))
+    snapshot = read_ply(folder / "snapshots/5/mesh.ply")["vertex"].columns["x"]
+    np.testing.assert_allclose(snapshot, factor * vertices[:, 0], rtol=1e-5)
+    recorded = json.loads((folder / EXPORTS).read_text())
+    assert recorded["export/section/section.svg"]["cut"] == pytest.approx(5 * factor)
+    assert recorded["export/glb/mesh.glb"]["textured"] is False
+
+
+@pytest.mark.parametrize(
+    "listed", ["[]", '{"a": 3}', '{"export/tum/trajectory.txt": {"to": []}}', "x"]
+)
+def test_a_damaged_list_of_exports_is_an_error_in_a_sentence(folder, listed, capsys):
+    export(ExportSettings(folder, "tum", device="cpu"))
+    (folder / EXPORTS).write_text(listed)
+    assert main(["scale", str(folder), "--from", KNOWN, "--device", "cpu"]) == 2
+    assert EXPORTS in capsys.readouterr().err
+    assert json.loads((folder / "summary.json").read_text())["scale"] == "arbitrary"
+
+
+def test_an_unfinished_run_is_finished_in_metres_instead(folder, capsys, monkeypatch):
+    monkeypatch.setattr("geogs.application.rescale.has_checkpoint", folder.__eq__)
+    assert main(["scale", str(folder), "--from", KNOWN, "--device", "cpu"]) == 2
+    assert f"geogs run --resume {folder} --scale-from {KNOWN}" in capsys.readouterr().err
 
 
 def test_what_cannot_be_scaled_stays_as_it_is(folder, capsys):

@@ -1,6 +1,9 @@
 """A result in the formats of other programs: reads its folder, writes one export."""
 
+import json
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,8 +23,10 @@ from geogs.application.results.result_page import result_lengths
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.application.results.upright import tracked_poses
+from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
+from geogs.io.writers.atomic import write_text
 from geogs.io.writers.exports.gsplat import write_gsplat_start
 from geogs.io.writers.exports.las import write_las
 from geogs.io.writers.exports.line_drawing import write_drawing
@@ -58,6 +63,12 @@ _SUFFIXES = frozenset(
     {suffix for _, *suffixes in _FILES.values() for suffix in suffixes} | {".laz"}
 )
 """Endings of files; a folder has none of these."""
+EXPORTS = "export/exports.json"
+"""List of the exports in the folder of a result."""
+_OPTIONS = tuple(
+    f.name for f in fields(ExportSettings) if f.name not in ("result", "output", "device")
+)
+"""What is kept of the settings of an export."""
 MOST_ON_PHONES = 200_000
 """Most triangles of a USDZ, which phones show without delay."""
 
@@ -95,7 +106,46 @@ def export(settings: ExportSettings) -> Path:
     folder = result.folder if settings.output is None else path if to not in _FILES else path.parent
     with claimed(folder) as output, replaced(output, "beside") as new:
         _write(new / path.relative_to(folder), part, settings)
+        if settings.output is None:
+            _record(new, folder, path, settings)
     return path
+
+
+def _record(new: Path, folder: Path, path: Path, settings: ExportSettings) -> None:
+    """Add an export in the folder of a result to the list of these, with its options."""
+    options = {
+        name: getattr(settings, name) for name in _OPTIONS
+    }  # fmt: skip
+    listed = {**_recorded(folder), str(path.relative_to(folder)): options}
+    write_text(new / EXPORTS, json.dumps(listed, indent=1, sort_keys=True) + "\n")
+
+
+def _recorded(folder: Path) -> dict[str, dict[str, Any]]:
+    """The exports in the folder of a result: options by their paths."""
+    if not (folder / EXPORTS).is_file():
+        return {}
+    listed = read_json(folder / EXPORTS)
+    if not isinstance(listed, dict) or not all(isinstance(v, dict) for v in listed.values()):
+        raise InputError(f"{folder / EXPORTS} is damaged; delete it, and export anew.")
+    return listed
+
+
+def exports_of(folder: Path, device: str) -> list[ExportSettings]:
+    """Settings by which the exports that lie in the folder of a result are made anew.
+
+    Raises:
+        InputError: the list of them is damaged.
+    """
+    try:
+        return [
+            ExportSettings(
+                folder, **{k: v for k, v in options.items() if k in _OPTIONS}, device=device
+            )
+            for path, options in _recorded(folder).items()
+            if (folder / path).exists()
+        ]
+    except (TypeError, InputError):
+        raise InputError(f"{folder / EXPORTS} is damaged; delete it, and export anew.") from None
 
 
 def _write(path: Path, part: Part, settings: ExportSettings) -> None:

@@ -26,7 +26,7 @@ count as one of ours.
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
@@ -59,11 +59,12 @@ later result replaces, such as exports."""
 
 
 @contextmanager
-def replaced(folder: Path, what: Extent) -> Iterator[Path]:
+def replaced(folder: Path, what: Extent, without: Collection[str] = ()) -> Iterator[Path]:
     """Yield a folder for new files; they move into place when the block ends without an error.
 
     No other process may write there meanwhile. Files keep the names of the new folder. All goes to
-    the folder that had the name at the beginning.
+    the folder that had the name at the beginning. Files of the existing result ``without`` which
+    the new part is are deleted, if nobody has changed them.
 
     Raises:
         OutputError: something cannot be written, a link or something else is in the way, a result
@@ -86,7 +87,7 @@ def replaced(folder: Path, what: Extent) -> Iterator[Path]:
                 raise OutputError(final.replace(new + os.sep, "")) from error
             raise
         with _sentence(folder):
-            _put_in_place(place, _committed(place, new, what))
+            _put_in_place(place, _committed(place, new, what, without))
         if not place.is_at_its_path():
             where = os.path.realpath(place.reach)
             raise OutputError(
@@ -155,14 +156,15 @@ def _ours(place: Directory) -> list[str]:
     return [match[0] for match in found if place.number(match[0]) == int(match[1])]
 
 
-def _committed(place: Directory, new: str, what: Extent) -> str:
+def _committed(place: Directory, new: str, what: Extent, without: Collection[str]) -> str:
     """Do the first and second step. Returns the name of the committed folder."""
     made: list[str] = []
     try:
         with place.inner(new) as files:
             if what != "beside":
                 own = {name: files.sha256(name) for name in files.files()}
-                listed = own if what == "result" else {**_listed(place), **own}
+                former = {} if what == "result" else _listed(place)
+                listed = {k: v for k, v in former.items() if k not in without} | own
                 text = json.dumps({"files": listed}, indent=0, sort_keys=True)
                 write_text(files.reach / LIST, text + "\n")
             for folder in files.folders():
