@@ -42,6 +42,9 @@ class ExportSettings(Settings):
     """Write a COLMAP model as text, which is binary otherwise."""
     points: Annotated[int, Range(100, 10_000_000)] = 50_000
     """Points with tracks to look for in colmap and nerfstudio."""
+    images: tuple[str, ...] = ()
+    """For colmap and nerfstudio: the video or folder that the run read, whose images are exported
+    at full size, undistorted; by default those that the run kept. Several as the run read them."""
     crop: str = ""
     """Part of a surface, a drawing or of splats: x0,y0,z0,x1,y1,z1 (a box: right, forward, up), or
     near:DISTANCE (from the camera's path)."""

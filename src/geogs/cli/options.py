@@ -8,7 +8,6 @@ option that is a tuple of texts can be repeated.
 
 import difflib
 import logging
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar

@@ -93,7 +93,9 @@ def export(settings: ExportSettings) -> Path:
         R = result.upright.y_down if to in _Y_DOWN else axes
         result = result.rotated(R)
         axes = axes @ R.T
-    part = Part(result, region, axes)
+    if settings.images and to not in ("colmap", "nerfstudio"):
+        raise InputError(f"--images is for colmap and nerfstudio, not {to}; leave it out.")
+    part = Part(result, region, axes, settings.images)
     place = settings.output or result.folder / "export" / settings.to
     name, *suffixes = _FILES.get(to, (to,))
     if to == "glb" and settings.textured and result.views.has_images:  # beside the plain one
@@ -153,9 +155,9 @@ def _write(path: Path, part: Part, settings: ExportSettings) -> None:
     result = part.result
     match settings.to:
         case "colmap":
-            write_colmap_set(path, result, settings.points, settings.text)
+            write_colmap_set(path, result, settings.points, settings.text, part.originals)
         case "nerfstudio":
-            write_nerfstudio_set(path, result, settings.points)
+            write_nerfstudio_set(path, result, settings.points, part.originals)
         case "depth" | "normals":
             write_map_set(path, result, settings.to)
         case "gsplat":

@@ -6,10 +6,12 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geogs.application.export.originals import open_originals
 from geogs.application.export.region import Region
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.upright import tracked_poses
 from geogs.errors import InputError
+from geogs.io.sources.frame_source import Source
 from geogs.mesh.clean import keep_faces
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
@@ -24,6 +26,13 @@ class Part:
     """All is kept where there is none."""
     axes: Float[np.ndarray, "3 3"]
     """Rows right, forward and up of the result's world."""
+    images: tuple[str, ...] = ()
+    """What the run read, where its images are exported at full size."""
+
+    @property
+    def originals(self) -> Source | None:
+        """The images at full size, if they are exported. Raises InputError as of opening them."""
+        return open_originals(self.result, self.images) if self.images else None
 
     def holds(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Which points are kept. Raises InputError if none is."""

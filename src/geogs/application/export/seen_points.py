@@ -34,16 +34,15 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
     number = np.cumsum(kept) - 1
     stays = np.flatnonzero(kept[point])
     stays = stays[np.argsort(point[stays], kind="stable")]
-    size = np.array([camera.width, camera.height])
     own = keyframes[0].camera
-    scale = size / np.array([own.width, own.height])
+    scale = np.array([camera.fx / own.fx, camera.fy / own.fy])
     return SeenPoints(
         positions[kept],
         normals[kept].astype(np.float32),
         colours[kept],
         number[point[stays]],
         image[stays].astype(np.int64),
-        (at[stays] + 0.5) * scale - 0.5,
+        (at[stays] - [own.cx, own.cy]) * scale + [camera.cx, camera.cy],
     )
 
 
