@@ -77,6 +77,18 @@ def test_page_holds_everything_escaped_and_in_order(tmp_path):
     assert "http" not in text
 
 
+def test_a_sentence_in_a_table_wraps_and_a_number_does_not(tmp_path):
+    """Else it pushes the numbers of all other rows out of the page."""
+    said = "the video: 437.8 +- 5.1 pixels, of 120 images and 3 rounds; the readout is 0.2 ms"
+    write_page(tmp_path / "p.html", "t", [TableSection("", (), [("a", said), ("b", "1 234")])])
+    text = (tmp_path / "p.html").read_text()
+    assert f"<td class=long>{said}</td>" in text
+    assert "<td>1 234</td>" in text
+    (style,) = re.findall(r"td\.long \{(.*?)\}", text)
+    assert "white-space: pre-wrap" in style
+    assert "max-width" in style
+
+
 def test_table_without_titles_has_no_head(tmp_path):
     write_page(tmp_path / "p.html", "t", [TableSection("", (), [("a", "1")])])
     text = (tmp_path / "p.html").read_text()

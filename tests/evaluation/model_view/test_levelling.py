@@ -107,6 +107,23 @@ def test_walls_and_ceilings_are_found_where_nothing_is_beyond():
     assert find_room(outwards, axes, circle()).high[2] == np.inf
 
 
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (0, -1), (1, 1), (1, -1), (2, 1)])
+def test_nothing_is_hidden_from_where_the_camera_was(axis, sign):
+    """Cameras that come near to a wall move its bound; one that they passed is none."""
+    straight = Rotation.identity()
+    surface = room(straight, clutter=0.2)
+    near = circle()
+    near[-1, axis, 3] = sign * (HALF[axis] - 0.05)
+    found = find_room(surface, np.eye(3), near)
+    bound = (found.high if sign > 0 else -found.low)[axis]
+    assert HALF[axis] > bound >= HALF[axis] - 0.05
+    near[-1, axis, 3] = sign * (HALF[axis] + 0.3)
+    passed = find_room(surface, np.eye(3), near)
+    assert (passed.high if sign > 0 else -passed.low)[axis] == np.inf
+    others = np.abs(np.concatenate([passed.high, passed.low[:2]]))
+    assert np.isfinite(others).sum() == 4
+
+
 def test_an_open_room_is_seen_from_where_it_is_open():
     """Of a room whose south and west were not seen, the inner sides of the others face one."""
     surface = room(Rotation.identity(), "NEF", clutter=0.1)

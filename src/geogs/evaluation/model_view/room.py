@@ -37,20 +37,23 @@ def find_room(
 ) -> Room:
     """Find the sides of a surface, in level axes, with a wall or a ceiling.
 
-    A wall is area that faces inwards, lies beyond most of the cameras, and has little beyond it.
+    A wall is area that faces inwards, lies beyond all cameras, and has little beyond it. Nothing is
+    hidden from a viewer at one of the cameras: in a corridor, they are near to walls.
     """
     local = surface.centres @ axes.T
     normals = surface.normals @ axes.T
-    cameras = np.median(T_wc[:, :3, 3] @ axes.T, axis=0)
+    cameras = T_wc[:, :3, 3] @ axes.T
     low, high = np.quantile(local, [0.005, 0.995], axis=0)
     extent = high - low
     bounds = np.full((2, 3), np.inf)
     for axis, sign in ((0, 1), (1, 1), (2, 1), (0, -1), (1, -1)):
         along = sign * local[:, axis]
         facing = sign * normals[:, axis]
-        place = _wall(along, facing, surface.areas, sign * cameras[axis], extent[axis])
+        farthest = float((sign * cameras[:, axis]).max())
+        place = _wall(along, facing, surface.areas, farthest, extent[axis])
         if place is not None:
-            bounds[(1 - sign) // 2, axis] = place - DEEP[axis] * extent[axis]
+            bound = max(place - DEEP[axis] * extent[axis], farthest)
+            bounds[(1 - sign) // 2, axis] = bound
     return Room(-bounds[1], bounds[0], float(low[2] + _GROUND * extent[2]))
 
 

@@ -13,6 +13,10 @@ from urllib.parse import quote
 from geogs.io.writers.atomic import write_text
 
 
+LONG = 40
+"""Characters of a cell beyond which it wraps."""
+
+
 @dataclass(frozen=True)
 class TableSection:
     """A table under a heading; the first column names a row, the others are right-aligned."""
@@ -137,13 +141,16 @@ def _table(section: TableSection) -> str:
     if section.columns:
         cells = "".join(f"<th>{html.escape(title)}</th>" for title in section.columns)
         head = f"<thead><tr>{cells}</tr></thead>"
-    rows = "\n".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-        for row in section.rows
-    )
+    rows = "\n".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in section.rows)
     note = f"<p class=note>{html.escape(section.note)}</p>" if section.note else ""
     table = f"<div class=wide><table>{head}<tbody>\n{rows}\n</tbody></table></div>"
     return _heading(section.heading) + table + note
+
+
+def _cell(text: str) -> str:
+    """A cell of a table; a sentence wraps, so that it pushes no other cell out of sight."""
+    mark = " class=long" if len(text) > LONG else ""
+    return f"<td{mark}>{html.escape(text)}</td>"
 
 
 def _figures(section: FiguresSection) -> str:
@@ -211,6 +218,7 @@ dt { color: var(--soft); font-size: 0.9em; } dd { margin: 0; font-size: 1.5em; l
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
 th, td { padding: 0.22em 1.2em 0.22em 0; border-bottom: 1px solid var(--line); white-space: pre;
   text-align: right; font-variant-numeric: tabular-nums; }
+td.long { white-space: pre-wrap; overflow-wrap: anywhere; text-align: left; max-width: 60ch; }
 th { font-weight: 600; } th:first-child, td:first-child { text-align: left; }
 tbody tr:hover { background: var(--box); }
 figure { margin: 0; } figure img { max-width: 100%; height: auto; border-radius: 6px;
