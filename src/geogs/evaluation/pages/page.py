@@ -12,7 +12,6 @@ from urllib.parse import quote
 
 from geogs.io.writers.atomic import write_text
 
-
 LONG = 40
 """Characters of a cell beyond which it wraps."""
 
