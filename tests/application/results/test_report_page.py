@@ -116,9 +116,7 @@ def test_page_draws_turns_and_says_nothing(tmp_path):
         tab.page.wait_for_selector("#model[data-state=drawn]", timeout=600_000)
         tab.page.wait_for_selector(".beside img[src]", timeout=600_000)
         assert "Reliable & sound." in tab.page.inner_text("p.verdict")
-        assert "Upright by its planes: 100% of the surface" in tab.page.inner_text(
-            "p.note >> nth=1"
-        )
+        assert "Metres." in tab.page.inner_text("p.note >> nth=1")
         first = drawn(tab)
         # One looks from above through walls that face away: the floor and the far walls are there.
         assert share(first, RED) > 0.03
