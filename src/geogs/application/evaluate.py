@@ -237,4 +237,7 @@ def _model_beside_truth(
     frames = result.trajectory
     camera = result.camera
     views = shown_views(result)
-    return shown_model(frames, views, camera, result.mesh, disks, unit, coloured, true_path)
+    renders = result.keyframes
+    return shown_model(
+        frames, views, camera, result.mesh, disks, unit, coloured, true_path, renders
+    )

@@ -1,5 +1,8 @@
 """The page of a result in a real browser: it draws, turns, and complains of nothing."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -8,7 +11,7 @@ from box_room import box, circle
 from browser import open_tab
 from geogs.application.results.result_page import ShownView, shown_model
 from geogs.evaluation.held_camera import level_axes
-from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths
+from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths, TextureModel
 from geogs.evaluation.model_view.start_view import start_view
 from geogs.evaluation.pages.run_page import lengths, write_run_page
 from geogs.geometry.camera import Camera
@@ -19,7 +22,7 @@ CAMERA = Camera(80.0, 80.0, 63.5, 47.5, 128, 96)
 RED, GREEN = [200, 30, 30], [30, 170, 40]
 
 
-def box_page(folder, with_truth: bool = False):
+def box_page(folder, with_truth: bool = False, with_texture: bool = False):
     """A page of a box with a red floor and green walls, seen from within by a circle of cameras."""
     vertices, faces = box((3.0, 2.0, 1.2))
     mesh = Mesh.from_triangles(vertices, faces)
@@ -43,6 +46,14 @@ def box_page(folder, with_truth: bool = False):
     blue = np.full_like(colours, (20, 40, 230))
     more = (lambda mesh: [Colouring("Error", blue, legend)]) if with_truth else (lambda mesh: ())
     model = shown_model(trajectory, views, CAMERA, mesh, disks, Lengths(1.0, "Metres."), more)
+    if with_texture:  # its upper half red, its lower half, which the floor has, blue
+        sheet = np.zeros((64, 64, 3), np.uint8)
+        sheet[:32, :, 0] = sheet[32:, :, 2] = 220
+        jpeg = cv2.imencode(".jpg", sheet[..., ::-1])[1].tobytes()
+        is_floor = (model.surface.vertices[:, 2] < -1.1) & (model.surface.normals[:, 2] > 0.9)
+        uv = np.stack([np.full(len(is_floor), 0.5), np.where(is_floor, 0.8, 0.2)], 1)
+        textured = replace(model.surface, texture=TextureModel(uv, jpeg), colourings=())
+        model = replace(model, surface=textured)
     verdict = {"sentence": "Reliable & sound.", "is_reliable": True}
     write_run_page(folder, {"source": "box", "frames": 60, "verdict": verdict}, model)
     return folder / "index.html"
@@ -178,4 +189,18 @@ def test_page_plays_the_path_and_measures(tmp_path):
         tab.page.wait_for_function(
             "() => Number(document.querySelector('[data-part=place]').value) > 3.5"
         )
+        assert tab.complaints == []
+
+
+@pytest.mark.system
+def test_the_page_shows_the_texture_the_right_way_up(tmp_path):
+    with open_tab(box_page(tmp_path, with_texture=True).as_uri()) as tab:
+        tab.page.wait_for_selector("#model[data-state=drawn]", timeout=600_000)
+        first = drawn(tab)
+        assert share(first, [0, 0, 1]) > 0.03
+        assert share(first, RED) > 0.05
+        tab.page.get_by_role("button", name="Shape").click()
+        plain = drawn(tab)
+        assert share(plain, RED) < 0.02
+        assert share(plain, [0, 0, 1]) < 0.02
         assert tab.complaints == []

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from geogs.application.results.page_surface import page_surface
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.upright import tracked_poses, upright
 from geogs.evaluation.model_view.levelling import facets
@@ -26,12 +27,11 @@ from geogs.evaluation.model_view.shown_model import (
 from geogs.evaluation.model_view.start_view import start_view
 from geogs.evaluation.pages.run_page import lengths, write_run_page
 from geogs.geometry.camera import Camera
-from geogs.mesh.decimation.decimate import with_at_most
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import ordered_map, worker_count
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
-MAX_FACES, MAX_DISKS, MAX_IMAGES = 240_000, 50_000, 240
+MAX_DISKS, MAX_IMAGES = 50_000, 240
 """Largest numbers of each on a page, which then has less than 8 MB."""
 IMAGE_BYTES = 1_500_000
 """Approximate size of all images of a page together in bytes."""
@@ -86,7 +86,9 @@ def write_page(
     if renders:
         views = _rendered_views(renders)
         camera = renders[0].camera
-        model = shown_model(trajectory, views, camera, mesh, disks, lengths(summary))
+        model = shown_model(
+            trajectory, views, camera, mesh, disks, lengths(summary), renders=renders
+        )
     _write_with_path(folder, trajectory, mesh, summary, model)
 
 
@@ -111,7 +113,15 @@ def write_page_anew(
     summary = result.summary if summary is None else summary
     faces = 0 if mesh is None else len(mesh.faces)
     views = shown_views(result)
-    model = shown_model(trajectory, views, result.camera, mesh, result.disks, lengths(summary))
+    model = shown_model(
+        trajectory,
+        views,
+        result.camera,
+        mesh,
+        result.disks,
+        lengths(summary),
+        renders=result.keyframes,
+    )
     write_pictures(new / "report", result.keyframes)
     _write_with_path(new / "report", trajectory, mesh, {**summary, "mesh_faces": faces}, model)
 
@@ -169,6 +179,7 @@ def shown_model(
     unit: Lengths,
     more_colourings: Callable[[Mesh], Sequence[Colouring]] = lambda mesh: (),
     true_path: Float[np.ndarray, "n 3"] | None = None,
+    renders: Sequence[RenderedKeyframe] = (),
 ) -> ShownModel:
     """The model for the page of a result.
 
@@ -181,13 +192,18 @@ def shown_model(
         unit: unit of length of the map.
         more_colourings: further colourings of the shown surface, besides the images' colours.
         true_path: positions of the true camera, in the frame of the map.
+        renders: the keyframes with depth, from whose images the surface gets a texture.
     """
     notes = []
     surface = None
     seen = None
     disk_model = None
     if mesh is not None and len(mesh.faces):
-        surface = _surface(with_at_most(mesh, MAX_FACES), more_colourings)
+        shown, texture = page_surface(mesh, renders)
+        colourings = more_colourings(shown)
+        if texture is None and shown.colours is not None:
+            colourings = [Colouring("Colour", shown.colours), *colourings]
+        surface = SurfaceModel(shown.vertices, shown.faces, shown.normals, colourings, texture)
         if len(surface.faces) < len(mesh.faces):
             notes.append(f"Shown with {len(surface.faces):,} of {len(mesh.faces):,} triangles.")
         seen = facets(surface.vertices, surface.faces, surface.normals)
@@ -215,13 +231,6 @@ def shown_model(
         unit,
         [unit.note, *notes],
     )
-
-
-def _surface(mesh: Mesh, more_colourings: Callable[[Mesh], Sequence[Colouring]]) -> SurfaceModel:
-    shown = mesh.creased()
-    own = [] if shown.colours is None else [Colouring("Colour", shown.colours)]
-    colourings = [*own, *more_colourings(shown)]
-    return SurfaceModel(shown.vertices, shown.faces, shown.normals, colourings)
 
 
 def _disks(disks: MapSnapshot) -> DiskModel:

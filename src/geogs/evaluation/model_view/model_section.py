@@ -95,6 +95,9 @@ def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
     }
     if model.surface is not None:
         scene["surface"] = _surface(model.surface, R, arrays)
+        if model.surface.texture is not None:
+            scene["surface"]["texture"] = [0, len(model.surface.texture.jpeg)]
+            images += model.surface.texture.jpeg
     scene["paths"] = [
         {
             "name": path.name,
@@ -144,6 +147,7 @@ def _surface(surface: SurfaceModel, R: np.ndarray, arrays: "_Arrays") -> dict[st
         "vertices": arrays.add(steps[order]),
         "faces": arrays.add(_face_differences(rank[surface.faces])),
         "normals": arrays.add(in_bytes(surface.normals @ R.T)[order]),
+        "uv": surface.texture and arrays.add(_in_steps(surface.texture.uv)[order]),
         "colourings": [
             {
                 "name": colouring.name,
@@ -177,6 +181,11 @@ def _disks(disks: DiskModel, R: np.ndarray, arrays: "_Arrays") -> dict[str, Any]
 def in_bytes(units: Float[np.ndarray, "n k"]) -> UInt[np.ndarray, "n k"]:
     """Numbers from -1 to 1 as bytes, of which 128 is zero."""
     return np.rint(units * 127 + 128).astype(np.uint8)
+
+
+def _in_steps(fractions: Float[np.ndarray, "n 2"]) -> UInt[np.ndarray, "n 2"]:
+    """Numbers from 0 to 1 in steps of 1 / 65 535."""
+    return np.rint(fractions.clip(0, 1) * STEPS).astype(np.uint16)
 
 
 def quantised(

@@ -37,6 +37,15 @@ class Legend:
 
 
 @dataclass(frozen=True)
+class TextureModel:
+    """An image of a surface."""
+
+    uv: Float[np.ndarray, "n 2"]
+    """Place of each vertex in the image, from 0 to 1, rightwards and downwards."""
+    jpeg: bytes
+
+
+@dataclass(frozen=True)
 class SurfaceModel:
     """Triangles, counter-clockwise seen from free space, and their colours."""
 
@@ -47,6 +56,8 @@ class SurfaceModel:
     """Unit, towards free space."""
     colourings: Sequence[Colouring] = ()
     """The first is shown first; without any the surface is plain."""
+    texture: TextureModel | None = None
+    """Shown before any of these, if there is one."""
 
 
 @dataclass(frozen=True)

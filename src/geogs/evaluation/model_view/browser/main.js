@@ -12,7 +12,7 @@ async function show() {
   const content = await inflated(embedded('model-arrays'));
   const stage = makeStage(box, scene);
   part('hint').textContent = HINT;
-  const surface = showThings(stage, scene, content);
+  const surface = showThings(stage, scene, content, await sheetOf(scene.surface));
   const bar = part('layers');
   for (const packed of scene.paths) {
     const path = makePath(stage, packed, content);
@@ -44,9 +44,9 @@ async function show() {
 }
 
 // The surface in one of its looks, or the disks in its place; the surface, if there is one.
-function showThings(stage, scene, content) {
+function showThings(stage, scene, content, sheet) {
   const room = makeRoom(scene.room, stage.camera);
-  const surface = scene.surface && makeSurface(scene.surface, content, room);
+  const surface = scene.surface && makeSurface(scene.surface, content, room, sheet);
   if (surface) stage.world.add(surface.group);
   let disks = null;
   const look = (name) => {
