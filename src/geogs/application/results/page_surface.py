@@ -12,6 +12,7 @@ from geogs.io.writers.exports.mesh_writers import encoded_jpeg
 from geogs.mesh.decimation.decimate import with_at_most
 from geogs.mesh.texture.textured import TexturedMesh, texture_mesh
 from geogs.mesh.triangle_mesh import Mesh, median_edge
+from geogs.on_demand import OnDemand
 from geogs.types import RenderedKeyframe
 
 MAX_FACES, MAX_TEXTURED = 240_000, 160_000
@@ -29,9 +30,8 @@ def page_surface(
     """
     count = min(len(renders), MAX_VIEWS)
     chosen = np.linspace(0, len(renders) - 1, count).round().astype(int).tolist()
-    seen = [renders[number] for number in chosen]
-    views = fusion_views([render for render in seen if render.image is not None])
-    if len(views):
+    if count and renders[0].image is not None:
+        views = fusion_views(OnDemand(chosen, renders.__getitem__))
         few = with_at_most(mesh, MAX_TEXTURED)
         try:
             textured = texture_mesh(few, views, 2 * median_edge(mesh), MAX_EDGE)

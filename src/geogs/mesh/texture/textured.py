@@ -1,7 +1,7 @@
 """Texturing of a mesh from the images of its views, their exposures compensated."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -77,13 +77,19 @@ def texture_mesh(
     neighbours = face_neighbours(mesh.faces)
     score = without_colour_outliers(candidates, gains)
     label = choose_views(candidates, score, neighbours)
-    images = {int(v): views[int(v)] for v in np.unique(label[label >= 0])}
+    images = {int(v): _image_alone(views[int(v)]) for v in np.unique(label[label >= 0])}
     patches = cut_patches(mesh, images, label, neighbours)
     colour = _corner_colours(patches, images, gains)
     corrections = seam_corrections(patches.corner_vertex, patches.edges(), colour)
     plain, swatches, swatch_of = _plain_colours(mesh, label)
     atlas = draw_atlas(patches, images, gains, corrections, swatches, limit)
     return _assembled(mesh, patches, plain, swatch_of, atlas)
+
+
+def _image_alone(view: DepthMapView) -> DepthMapView:
+    """The view without its depth map, which would fill the memory."""
+    depth, weight = (values[:1, :1].clone() for values in (view.depth, view.weight))
+    return replace(view, depth=depth, weight=weight)
 
 
 def view_gains(candidates: Candidates, views: int) -> Float32[np.ndarray, "v 3"]:
