@@ -14,6 +14,7 @@ from geogs.evaluation.duration import duration
 from geogs.io.sources.formats.colmap import open_colmap
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.selection import selection_of
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.replacement import replaced
 from geogs.threads import worker_count
@@ -47,7 +48,7 @@ def open_photographs(
     progress = progress or RunProgress()
     stop = stop or Stop()
     chosen = find_photographs(folder)
-    selection = config.input
+    selection = selection_of(config.input, None)
     some = chosen.photographs[selection.start : selection.stop : selection.stride]
     chosen = replace(chosen, photographs=some)
     note = kept / "photographs.json"

@@ -237,7 +237,7 @@ def _model_beside_truth(
     frames = result.trajectory
     camera = result.camera
     views = shown_views(result)
-    renders = result.keyframes
+    renders = result.renders
     return shown_model(
         frames, views, camera, result.mesh, disks, unit, coloured, true_path, renders
     )

@@ -120,9 +120,9 @@ def write_page_anew(
         mesh,
         result.disks,
         lengths(summary),
-        renders=result.keyframes,
+        renders=result.renders,
     )
-    write_pictures(new / "report", result.keyframes)
+    write_pictures(new / "report", result.renders)
     _write_with_path(new / "report", trajectory, mesh, {**summary, "mesh_faces": faces}, model)
 
 
