@@ -89,7 +89,7 @@ def ends_with(monkeypatch, tmp_path):
     ("verdict", "options", "code"),
     [
         (RELIABLE, [], 0), (RELIABLE, ["--strict"], 0), (DOUBTFUL, [], 3),
-        (DOUBTFUL, ["--no-strict"], 0), (DOUBTFUL, ["-q"], 3), (None, [], 0),
+        (DOUBTFUL, ["--no-strict"], 0), (DOUBTFUL, ["-q"], 3), (None, [], 130),
     ],
 )  # fmt: skip
 def test_a_result_that_is_not_reliable_has_its_own_exit_code(
