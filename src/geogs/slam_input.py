@@ -95,11 +95,10 @@ def _checked(frame: Frame, camera: Camera) -> Frame:
     check_fields(frame)
     check_image(frame.image, camera)
     require_mask(frame.mask, camera)
-    seconds = _seconds(frame.timestamp)
     pose = frame.pose
     if pose is not None:
         pose = replace(pose, T_cw=as_pose(pose.T_cw))
-    return replace(frame, index=int(frame.index), timestamp=seconds, pose=pose)
+    return replace(frame, index=int(frame.index), timestamp=float(frame.timestamp), pose=pose)
 
 
 def check_image(image: object, camera: Camera) -> None:
