@@ -67,8 +67,8 @@ class InputConfig(Settings, group="input"):
     panorama; a half and a view joined by +, such as top+front. auto takes all and refuses stereo
     pairs and panoramas, none takes all unasked. Given intrinsics hold for the part."""
     start: Annotated[int | str, Moment(), Range(0), Basic("--start")] = 0
-    """First frame of the source, from 0, or a time in it, such as 90s or 1:30."""
+    """First frame of the source, from 0, or its time."""
     stop: Annotated[int | str | None, Moment(), Range(above="start"), Basic("--stop")] = None
-    """Frame before which to stop, or a time, such as 90s or 1:30; none reads to the end."""
+    """Frame or time before which to stop; none reads to the end."""
     stride: Annotated[int, Range(1), Basic("--stride")] = 1
     """Use every stride-th frame."""
