@@ -143,6 +143,7 @@ def gpus(options: argparse.Namespace) -> None:
     count = torch.cuda.device_count()
     ways = [(1, 1.0), (1, options.share)] + [(count, 1.0), (count, options.share)] * (count > 1)
     warm = [*GEOGS, "run", str(rooms[0]), "-q", "-o", str(options.folder / "warm")]
+    warm += ["--overwrite", "--no-strict"]
     subprocess.run([*warm, "--device", "cuda", "--preset", options.preset], check=True)
     minutes = {}
     for seen, share in ways:
@@ -181,7 +182,7 @@ def join(options: argparse.Namespace) -> None:
             "-o", str(out["joined"]), *told,
         ],
         "one run": [*GEOGS, "run", str(whole), "--device", options.device, "-o",
-                    str(out["one run"]), *told],
+                    str(out["one run"]), "--overwrite", "--no-strict", *told],
     }  # fmt: skip
     for name, command in commands.items():
         seconds = took(command)

@@ -67,7 +67,8 @@ def repetitions(video: Path, folder: Path, repeats: int, seconds: float) -> dict
     frames, end = 0, time.monotonic() + seconds
     for _ in range(repeats):
         begin = time.monotonic()
-        settings = RunSettings((video,), preset("fast"), output=folder / "again", device="cpu")
+        output = folder / "again"
+        settings = RunSettings((video,), preset("fast"), output, "cpu", overwrite=True)
         frames = run(settings).scene.frames
         gc.collect()
         used.append(bytes_in_use())

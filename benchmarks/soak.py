@@ -115,7 +115,8 @@ class Soak:
             return [f"geogs synth ends with {synth.code}: {synth.last}"]
         words = settings(dice)
         (folder / "settings.txt").write_text(" ".join(words) + "\n")
-        command = [*GEOGS, "run", str(video), "--device", "cpu", *words]
+        usual = ("--device", "cpu", "--overwrite", "--no-strict")
+        command = [*GEOGS, "run", str(video), *usual, *words]
         whole = self._ended([*command, "-o", str(twin)])
         wrong = [f"undisturbed: {what}" for what in whole.wrong((0, 2))]
         last, more = self._disturbed([*command, "-o", str(out)], out, whole.seconds, dice)
@@ -148,6 +149,7 @@ class Soak:
             command = first
             if is_open:
                 command = [*GEOGS, "run", "--resume", str(out), "--device", "cpu"]
+                command.append("--no-strict")
                 with self._lock:
                     self.report.resumes += 1
 
