@@ -369,7 +369,7 @@ def test_a_camera_that_does_not_move_leaves_orientations(name, tmp_path, capsys)
     assert "Rotation only: no shape." in said
     assert words in said
     end = told.err.splitlines()[-1]
-    assert end.startswith(f"error: There is no mesh; the rest is in {tmp_path / 'out'}/. ")
+    assert end.startswith(f"error: No mesh was made; the other files are in {tmp_path / 'out'}/. ")
     assert words in end
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert words in summary["not_started"]

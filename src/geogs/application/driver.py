@@ -178,7 +178,7 @@ class Driver:
             for path in new.iterdir():
                 path.rename(files / path.name)
         self.progress.write(
-            f"The complete result in {self.output} stays; what there is now goes to {other}."
+            f"The interrupted result goes to {other}; the complete one in {self.output} stays."
         )
         return other
 

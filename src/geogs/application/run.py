@@ -94,7 +94,7 @@ def _report_settings(settings: RunSettings, defers_map: bool, progress: RunProgr
     config = settings.config
     knows_metres = scale_source(settings.scale_from) is not None or config.input.depth != "none"
     if settings.sfm and knows_metres:
-        raise InputError("--sfm knows no metres: leave out --scale-from and --depth.")
+        raise InputError("--sfm gives no metric scale; leave out --scale-from and --depth.")
     if not settings.sfm:
         for sentence in idle_settings(config, defers_map, _is_live(settings)):
             progress.write(f"note: {sentence}")
@@ -232,7 +232,7 @@ def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSet
         )
     if _is_live(settings):
         raise InputError(
-            "A live source comes but once; give the video that the run was begun with."
+            "A live source cannot be read again; give the video that the run was begun with."
         )
     same_place = with_files_of(begun.settings, settings).deciding()
     elsewhere = settings.output is not None and settings.output.resolve() != output.resolve()

@@ -143,9 +143,7 @@ class TrackedVideo:
         with slam.stopwatch("preview"):
             is_there = write_preview(driver.output, slam)
         if is_there:
-            driver.progress.write(
-                f"A first, rough mesh is in {driver.output / PREVIEW}, until the other one is made."
-            )
+            driver.progress.write(f"A rough preview of the mesh is in {driver.output / PREVIEW}.")
 
     def _adjust(self, driver: Driver, new: Path) -> None:
         self.scene.adjust(driver.report)

@@ -58,7 +58,9 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
         return printed(options.config)
     is_live = any(live_address(source) is not None for source in options.source)
     if options.sfm and is_live:
-        raise InputError("--sfm reads a video several times; a live source comes but once.")
+        raise InputError(
+            "--sfm reads a video several times; a live source cannot be."
+        )
     if options.sfm and options.map is not None:
         raise InputError("--map needs tracking; leave out --sfm.")
 
@@ -71,7 +73,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
 
     settings, stop = record(RunSettings, options), Interruption()
     if options.sfm and options.resume is None and (options.viewer or options.record):
-        raise InputError("--viewer and --record follow tracking, which --sfm has none of.")
+        raise InputError("--viewer and --record show tracking; leave them out with --sfm.")
     go = partial(run, kernels=kernels)
     if options.resume is not None:
         go = partial(resume, options.resume)

@@ -36,7 +36,7 @@ from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs_bench.runners.colour_baseline import require_packages, train_baseline
 from geogs_bench.runners.task import Task
 
-_NO_SETTINGS = ("source", "output", "resume", "checkpoint_every")
+_NO_SETTINGS = ("source", "output", "overwrite", "resume", "checkpoint_every")
 """Settings that do not change a result."""
 FOLDER = "before"
 """Folder, next to those of the variants, of a map before its correction."""

@@ -73,7 +73,7 @@ def test_the_video_may_lie_elsewhere_by_now():
 
 @pytest.mark.parametrize("address", ["camera:0", "-", "rtsp://host/path", "play:/data/a.mp4"])
 def test_what_does_not_wait_is_not_gone_on_with(address):
-    with pytest.raises(InputError, match="A live source comes but once"):
+    with pytest.raises(InputError, match="A live source cannot be read again"):
         settings("--", address)
 
 

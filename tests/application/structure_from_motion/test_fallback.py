@@ -94,7 +94,7 @@ def test_the_better_of_two_worlds(placed, tracked, better):
     ("settings", "source", "reason"),
     [
         ({}, {}, ""),
-        ({}, {"is_live": True}, "comes but once"),
+        ({}, {"is_live": True}, "cannot be read again"),
         ({"map": Path("old")}, {}, "saved map"),
         ({"scale_from": "height:1.6"}, {}, "no metres"),
         ({}, {"uses_depth": True}, "no metres"),

@@ -105,7 +105,7 @@ class Result:
         """The surface of the map; none where none was found, or where depths are too uncertain,
         which ``progress`` then reports."""
         if self.verdict is not None and not self.verdict.has_shape:
-            self.progress.write("No mesh: nothing tells the depths of what was seen.")
+            self.progress.write("No mesh: the depths could not be determined.")
             return None
         renders = self.renders
         with self.scene.stopwatch("mesh"):

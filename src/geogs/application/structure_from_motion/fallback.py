@@ -227,11 +227,11 @@ def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
 def impossible(settings: RunSettings, source: Source) -> str:
     """Reason why the frames cannot be located by structure from motion; empty where they can."""
     if source.is_live:
-        return "a live source comes but once; geogs run on its recording would."
+        return "a live source cannot be read again; geogs run on its recording would."
     if settings.map is not None:
         return "a saved map needs tracking."
     if settings.scale_from or source.uses_depth or source.uses_poses:
-        return "it knows no metres; geogs run --sfm without them does it."
+        return "it gives no metric scale; geogs run --sfm without them does it."
     return ""
 
 
