@@ -75,7 +75,8 @@ def place(small_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     def quick_posed(name: str) -> ReconstructConfig:
         c = reconstruct_preset(name)
         reading = replace(c.input, stride=4)
-        return replace(c, input=reading, search=replace(c.search, steps_per_view=1, repeat=False))
+        search = replace(c.search, least_steps=10, most_steps_per_view=2, repeat=False)
+        return replace(c, input=reading, search=search)
 
     monkeypatch.setattr(run, "preset", quick)
     monkeypatch.setattr(reconstruct, "reconstruct_preset", quick_posed)

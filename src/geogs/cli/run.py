@@ -58,9 +58,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
         return printed(options.config)
     is_live = any(live_address(source) is not None for source in options.source)
     if options.sfm and is_live:
-        raise InputError(
-            "--sfm reads a video several times; a live source cannot be."
-        )
+        raise InputError("--sfm reads a video several times; a live source cannot be.")
     if options.sfm and options.map is not None:
         raise InputError("--map needs tracking; leave out --sfm.")
 
