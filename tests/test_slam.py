@@ -46,6 +46,7 @@ SMALL = [
     "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
     "--mapping.pose-iterations", "1", "--mapping.final-iterations", "10",
     "--tracking.init-keyframes", "6", "--mapping.depth.planes", "48", "--device", "cpu",
+    "--no-strict",
 ]  # fmt: skip
 
 
@@ -387,7 +388,7 @@ def test_a_result_of_little_worth_says_so(small_room, tmp_path, capsys):
     frames = [cv2.imread(str(f)) for f in files] + [noise(i) for i in range(20)]
     folder, out = images(tmp_path / "images", frames), tmp_path / "out"
     argv = ["run", str(folder), "-o", str(out), "--intrinsics", camera_of(small_room), *SMALL]
-    assert cli.main(argv) == 0
+    assert cli.main([*argv, "--strict"]) == 3
     assert "not tracked" in capsys.readouterr().err
     ((first, last),) = json.loads((out / "summary.json").read_text())["lost_spans"]
     assert (round(30 * first), round(30 * last)) == (20, 39)

@@ -86,7 +86,7 @@ def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd
     assert result.mesh is not None
     assert len(result.mesh.faces) > 300
     argv = [str(small_room), "-o", str(tmp_path / "out"), *RUN, "--device", "cpu"]
-    assert cli.main(["run", *argv]) == 0
+    assert cli.main(["run", *argv]) in (0, 3)
     said = capfd.readouterr()
     verdict, counts, where, page = said.out.splitlines()
     assert verdict == result.verdict.sentence

@@ -91,7 +91,7 @@ def goes_on(out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """What ``geogs run --resume`` says while it ends a run."""
     capsys.readouterr()
     code, said = cli.main(["run", "--resume", str(out)]), capsys.readouterr()
-    assert code == 0, said.err
+    assert code in (0, 3), said.err
     return said.err
 
 

