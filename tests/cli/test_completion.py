@@ -62,6 +62,7 @@ def test_options_are_offered_few_at_first_and_all_that_begin_so(offered):
     assert {"--mapping.window", "--mask", "--map"} <= set(all_)
     assert offered("run", "a.mp4", "--no-fall") == ["--no-fallback"]
     assert offered("reconstruct", "--global-ba") == []
+    assert offered("weights", "--js") == ["--json"]
 
 
 def test_values_are_offered_after_the_option_they_belong_to(offered):

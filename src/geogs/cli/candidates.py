@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from geogs.cli.answer import JSON, JSON_HELP
 from geogs.cli.help import first_clause, is_shown_first
 from geogs.config.leaves import Leaf
 from geogs.config.setting import Positional, dashed
@@ -25,7 +26,8 @@ def candidates(known: Sequence[Leaf], typed: Sequence[str]) -> dict[str, str]:
         return dict.fromkeys(last.kind.choices, "")
     if unfinished.startswith("-"):
         offered = known if unfinished.strip("-") else filter(is_shown_first, known)
-        return {name: first_clause(leaf.help) for leaf in offered for name in _names(leaf)}
+        found = {name: first_clause(leaf.help) for leaf in offered for name in _names(leaf)}
+        return {**found, JSON: JSON_HELP}
     places = (leaf for leaf in known if leaf.mark(Positional) is not None)
     return {choice: "" for leaf in places for choice in leaf.kind.choices}
 
