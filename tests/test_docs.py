@@ -1,11 +1,15 @@
 """What the texts name is there: files, and settings by their options."""
 
 import re
+import shlex
 from itertools import chain
 from pathlib import Path
 
 import pytest
 
+from geogs.application.export.region import read_region
+from geogs.application.result_settings import ExportSettings, LocateSettings, RescaleSettings
+from geogs.cli.options import parse_options
 from geogs.config import Config, ReconstructConfig
 from geogs.config.leaves import leaves
 
@@ -42,6 +46,24 @@ def _is_there(name: str) -> bool:
     return any(ROOT.glob(name)) or any(
         any((ROOT / folder).glob(f"**/{name}")) for folder in ("src", "benchmarks", "tests")
     )
+
+
+_COMMANDS = {"export": ExportSettings, "locate": LocateSettings, "scale": RescaleSettings}
+LINES = sorted(
+    {
+        line.split("#")[0].strip()
+        for text in (*TEXTS, *(ROOT / "docs/tutorials").glob("*.md"))
+        for line in re.findall(r"^geogs (?:export|locate|scale) .*$", text.read_text(), re.M)
+    }
+)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_commands_on_results_are_understood_as_they_stand(line: str) -> None:
+    _, command, *arguments = shlex.split(line)
+    options = parse_options(_COMMANDS[command], arguments, command)
+    if command == "export":
+        read_region(options.crop)
 
 
 def test_settings_that_the_texts_name_exist() -> None:
