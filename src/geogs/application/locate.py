@@ -27,9 +27,6 @@ from geogs.pose_estimate import PoseEstimate
 from geogs.threads import on_one_torch_thread
 from geogs.types import Frame
 
-NEAREST = 3
-"""Number of keyframes that are named."""
-
 
 @dataclass(frozen=True)
 class NearKeyframe:
@@ -125,12 +122,12 @@ def locate(settings: LocateSettings) -> Located:
 def near_keyframes(
     T_cw: Float64[np.ndarray, "4 4"], result: SavedResult
 ) -> tuple[NearKeyframe, ...]:
-    """The keyframes nearest to a pose, by distance relative to the depths, and by orientation."""
+    """The three keyframes nearest to a pose, by distance over the depths and by orientation."""
     T_wc = np.linalg.inv(result.views.T_cw)
     distance = np.linalg.norm(T_wc[:, :3, 3] - np.linalg.inv(T_cw)[:3, 3], axis=1)
     cosine = (np.einsum("kij,ij->k", result.views.T_cw[:, :3, :3], T_cw[:3, :3]) - 1) / 2
     angle = np.arccos(cosine.clip(-1, 1))
-    order = np.argsort(distance / _depth(result) + angle, kind="stable")[:NEAREST]
+    order = np.argsort(distance / _depth(result) + angle, kind="stable")[:3]
     return tuple(
         NearKeyframe(
             int(k), float(result.views.timestamp[k]), float(distance[k]),

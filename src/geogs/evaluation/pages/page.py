@@ -12,9 +12,6 @@ from urllib.parse import quote
 
 from geogs.io.writers.atomic import write_text
 
-LONG = 40
-"""Characters of a cell beyond which it wraps."""
-
 
 @dataclass(frozen=True)
 class TableSection:
@@ -148,7 +145,7 @@ def _table(section: TableSection) -> str:
 
 def _cell(text: str) -> str:
     """A cell of a table; a sentence wraps, so that it pushes no other cell out of sight."""
-    mark = " class=long" if len(text) > LONG else ""
+    mark = " class=long" if len(text) > 40 else ""
     return f"<td{mark}>{html.escape(text)}</td>"
 
 

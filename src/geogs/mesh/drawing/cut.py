@@ -7,11 +7,6 @@ from jaxtyping import Bool, Float
 
 from geogs.mesh.triangle_mesh import Mesh
 
-FLOOR_SHARE = 0.1
-"""Least fraction of the level area that is a floor, and not the top of a thing below it."""
-_BINS = 100
-"""Heights that are distinguished in the search for the floor."""
-
 
 @dataclass(frozen=True)
 class Cut:
@@ -73,9 +68,10 @@ def heights(mesh: Mesh) -> tuple[float, float]:
     area = np.linalg.norm(double, axis=1)
     is_level = double[:, 2] > np.cos(np.radians(20)) * area
     centres = corners[is_level, :, 2].mean(1)
-    found, edges = np.histogram(centres, _BINS, (low, high), weights=area[is_level])
+    found, edges = np.histogram(centres, 100, (low, high), weights=area[is_level])
     around = np.convolve(found, np.ones(3), "same")
-    is_floor = around > FLOOR_SHARE * max(float(found.sum()), 1e-300)
+    # A tenth of the level area is a floor, and not the top of a thing below it.
+    is_floor = around > 0.1 * max(float(found.sum()), 1e-300)
     if not is_floor.any():
         return float(low), float(high)
     lowest = int(is_floor.argmax())

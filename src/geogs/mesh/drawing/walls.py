@@ -12,8 +12,6 @@ OFF, GAP, SHORTEST = 1 / 200, 1 / 20, 1 / 15
 length of a wall, all as fractions of the cut's extent."""
 TURNED = 35.0
 """Largest angle between a line and its wall, degrees: surfaces are rough."""
-COVERED = 0.6
-"""Least fraction of a wall that lines cover."""
 _DIRECTIONS = 180
 """Tested directions of walls, over the whole turn."""
 
@@ -137,7 +135,7 @@ def _runs(
     for part in np.split(order, starts):
         length = float(along[part, 1].max() - along[part, 0].min())
         covered = float((along[part, 1] - along[part, 0]).sum())
-        if length > SHORTEST * extent and covered > COVERED * length:
+        if length > SHORTEST * extent and covered > 0.6 * length:
             runs.append(on[part])
     return runs
 

@@ -16,7 +16,6 @@ _SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
 """Scales of a drawing on paper, as 1 to so many."""
 _PAPER, _MARGIN = (0.277, 0.19), 0.02
 """Largest size of what is drawn, metres on paper (A4 without its margins), and its margin."""
-_INCH = 0.0254
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ def _on_paper(drawing: LineDrawing, kind: str) -> bytes:
     scale = float(next((s for s in _SCALES if s >= least), least)) if is_metric else least
     paper = size / scale + 2 * _MARGIN
     with rc_context({"svg.hashsalt": "geogs", "svg.fonttype": "none", "pdf.fonttype": 42}):
-        figure = Figure(figsize=tuple(paper / _INCH))
+        figure = Figure(figsize=tuple(paper / 0.0254))
         plot = figure.add_axes((0, 0, 1, 1))
         middle = (low + high) / 2
         plot.set(xlim=middle[0] + np.array([-0.5, 0.5]) * paper[0] * scale)

@@ -15,7 +15,6 @@ from geogs.io.pose_files import OPENCV_FROM_OPENGL
 from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.mesh_writers import encoded_jpeg, linear
 
-_ALIGNMENT = 64
 _TEXTURE = "texture.jpg"
 _SHADED = """
   def Material "material" {
@@ -70,16 +69,7 @@ def write_usdz(
     Raises:
         OutputError: the file cannot be written.
     """
-    axes = OPENCV_FROM_OPENGL[:3, :3]
-    points = vertices @ axes
-    parts = [
-        f"float3[] extent = [{_rows(np.stack([points.min(0), points.max(0)]))}]",
-        "int[] faceVertexCounts = [" + ", ".join(["3"] * len(faces)) + "]",
-        "int[] faceVertexIndices = [" + ", ".join(map(str, faces.ravel().tolist())) + "]",
-        f"point3f[] points = [{_rows(points)}]",
-        f'normal3f[] normals = [{_rows(normals @ axes)}] (interpolation = "vertex")',
-        'uniform token subdivisionScheme = "none"',
-    ]
+    parts = _geometry(vertices, faces, normals)
     files = {}
     material = ""
     if isinstance(look, tuple):
@@ -104,6 +94,24 @@ def write_usdz(
         stream.write(_archive({"model.usda": model.encode(), **files}))
 
 
+def _geometry(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+) -> list[str]:
+    """Attributes of a mesh, turned to y up."""
+    axes = OPENCV_FROM_OPENGL[:3, :3]
+    points = vertices @ axes
+    return [
+        f"float3[] extent = [{_rows(np.stack([points.min(0), points.max(0)]))}]",
+        "int[] faceVertexCounts = [" + ", ".join(["3"] * len(faces)) + "]",
+        "int[] faceVertexIndices = [" + ", ".join(map(str, faces.ravel().tolist())) + "]",
+        f"point3f[] points = [{_rows(points)}]",
+        f'normal3f[] normals = [{_rows(normals @ axes)}] (interpolation = "vertex")',
+        'uniform token subdivisionScheme = "none"',
+    ]
+
+
 def _rows(values: Float[np.ndarray, "n k"]) -> str:
     return ", ".join("(" + ", ".join(f"{x:.6g}" for x in row) + ")" for row in values.tolist())
 
@@ -115,7 +123,7 @@ def _archive(files: dict[str, bytes]) -> bytes:
         for name, data in files.items():
             entry = zipfile.ZipInfo(name)
             begins = buffer.tell() + 30 + len(name) + 4  # of a header with an empty extra field
-            padding = -begins % _ALIGNMENT
+            padding = -begins % 64
             entry.extra = b"\x86\x19" + padding.to_bytes(2, "little") + bytes(padding)
             archive.writestr(entry, data)
     return buffer.getvalue()
