@@ -66,7 +66,9 @@ def open_photographs(
         most = features_for(count, seconds)
         with replaced(kept, "beside") as new:
             model_new = new / model.relative_to(kept)
-            found = find_poses(chosen, model_new, config.input.intrinsics, config.seed, report, most)
+            found = find_poses(
+                chosen, model_new, config.input.intrinsics, config.seed, report, most
+            )
             write_text(new / note.name, json.dumps(asdict(found), indent=2))
     source = _source(folder, chosen, model, found, config, hold_out)
     count = len(chosen.photographs) + len(chosen.damaged)
