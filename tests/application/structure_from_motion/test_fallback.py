@@ -96,9 +96,9 @@ def test_the_better_of_two_worlds(placed, tracked, better):
         ({}, {}, ""),
         ({}, {"is_live": True}, "cannot be read again"),
         ({"map": Path("old")}, {}, "saved map"),
-        ({"scale_from": "height:1.6"}, {}, "no metres"),
-        ({}, {"uses_depth": True}, "no metres"),
-        ({}, {"uses_poses": True}, "no metres"),
+        ({"scale_from": "height:1.6"}, {}, "no metric scale"),
+        ({}, {"uses_depth": True}, "no metric scale"),
+        ({}, {"uses_poses": True}, "no metric scale"),
     ],
 )
 def test_what_cannot_be_placed_once_more(settings, source, reason):
