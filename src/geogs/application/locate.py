@@ -151,6 +151,7 @@ def _draw(
     views = [result.render(T_cw), result.render(result.views.T_cw[number])]
     keyframe = result.image(number)
     assert keyframe is not None, "results without images are refused"
-    draw_keyframes(
-        path, [frame.image, keyframe], [v.depth for v in views], [v.normal for v in views]
-    )
+    images = [frame.image, keyframe]
+    depths = [view.depth for view in views]
+    normals = [view.normal for view in views]
+    draw_keyframes(path, images, depths, normals, result_lengths(result).name)

@@ -9,13 +9,14 @@ import pytest
 import torch
 
 import geogs
-from geogs.application.export.export import export
+from geogs.application.export.export import export, exports_of
 from geogs.application.result_settings import ExportSettings
 from geogs.application.results.write import write_config
 from geogs.camera.distortion import undistorted_rays
 from geogs.camera.shutter.shutter import Shutter
 from geogs.cli.main import main
 from geogs.config import Config
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_posed_source, open_source
@@ -92,6 +93,14 @@ def test_points_are_seen_where_the_full_camera_projects_them(run_result, tmp_pat
             image = model.images[seen.image_id]
             own = image.points2D[seen.point2D_idx]
             np.testing.assert_allclose(image.project_point(point.xyz), own.xy, atol=1e-3)
+
+
+def test_the_list_of_exports_names_no_video(run_result):
+    """What a list in a folder from elsewhere names would be opened."""
+    folder, source = run_result
+    export(ExportSettings(folder, "colmap", images=(str(source),), points=300, device="cpu"))
+    with pytest.raises(InputError, match="was made with --images"):
+        exports_of(folder, "cpu")
 
 
 def test_other_images_are_refused_in_a_sentence(run_result, tmp_path, capsys):

@@ -115,9 +115,7 @@ def export(settings: ExportSettings) -> Path:
 
 def _record(new: Path, folder: Path, path: Path, settings: ExportSettings) -> None:
     """Add an export in the folder of a result to the list of these, with its options."""
-    options = {
-        name: getattr(settings, name) for name in _OPTIONS
-    }  # fmt: skip
+    options = {name: getattr(settings, name) for name in _OPTIONS}
     listed = {**_recorded(folder), str(path.relative_to(folder)): options}
     write_text(new / EXPORTS, json.dumps(listed, indent=1, sort_keys=True) + "\n")
 
@@ -136,18 +134,25 @@ def exports_of(folder: Path, device: str) -> list[ExportSettings]:
     """Settings by which the exports that lie in the folder of a result are made anew.
 
     Raises:
-        InputError: the list of them is damaged.
+        InputError: the list of them is damaged, or one has the images of what the run read, which a
+            list may not name.
     """
-    try:
-        return [
-            ExportSettings(
-                folder, **{k: v for k, v in options.items() if k in _OPTIONS}, device=device
+    found = []
+    for path, options in _recorded(folder).items():
+        if not (folder / path).exists():
+            continue
+        if options.get("images"):
+            raise InputError(
+                f"{folder / path} was made with --images; delete it, and export it anew afterwards."
             )
-            for path, options in _recorded(folder).items()
-            if (folder / path).exists()
-        ]
-    except (TypeError, InputError):
-        raise InputError(f"{folder / EXPORTS} is damaged; delete it, and export anew.") from None
+        known = {k: v for k, v in options.items() if k in _OPTIONS and k != "images"}
+        try:
+            found.append(ExportSettings(folder, **known, device=device))
+        except (TypeError, InputError):
+            raise InputError(
+                f"{folder / EXPORTS} is damaged; delete it, and export anew."
+            ) from None
+    return found
 
 
 def _write(path: Path, part: Part, settings: ExportSettings) -> None:

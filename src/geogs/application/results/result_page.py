@@ -49,7 +49,9 @@ class ShownView:
     image: Callable[[], UInt8[np.ndarray, "h w 3"] | None]
 
 
-def write_pictures(folder: Path, renders: Sequence[RenderedKeyframe]) -> None:
+def write_pictures(
+    folder: Path, renders: Sequence[RenderedKeyframe], unit: str = "map units"
+) -> None:
     """Draw ``keyframes.png``: renders beside images, of up to five keyframes.
 
     Raises:
@@ -66,6 +68,7 @@ def write_pictures(folder: Path, renders: Sequence[RenderedKeyframe]) -> None:
         [run_pictures.layer_picture(r, "image") for r in shown],
         [r.depth.cpu().numpy() for r in shown],
         [r.normal.cpu().numpy() for r in shown],
+        unit,
     )
 
 
@@ -122,7 +125,7 @@ def write_page_anew(
         lengths(summary),
         renders=result.renders,
     )
-    write_pictures(new / "report", result.renders)
+    write_pictures(new / "report", result.renders, lengths(summary).name)
     _write_with_path(new / "report", trajectory, mesh, {**summary, "mesh_faces": faces}, model)
 
 

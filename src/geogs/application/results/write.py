@@ -9,10 +9,11 @@ from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.result import Result
 from geogs.application.results.result_page import write_page, write_pictures
-from geogs.application.results.summary import summarise
+from geogs.application.results.summary import source_summary, statistics, summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.application.settings_file import settings_text
 from geogs.config import Config, ReconstructConfig
+from geogs.evaluation.pages.run_page import lengths
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
@@ -109,7 +110,8 @@ def _write_map(
 def _write_pictures(output: Path, result: Result, shown: Sequence[RenderedKeyframe]) -> None:
     """Draw the pictures of the report, in parallel to the mesh."""
     with result.scene.stopwatch.aside():
-        write_pictures(output / "report", shown)
+        scale = {**source_summary(result.source), **statistics(result.scene)}
+        write_pictures(output / "report", shown, lengths(scale).name)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:

@@ -92,6 +92,7 @@ def draw_keyframes(
     images: Sequence[UInt8[np.ndarray, "ih iw 3"]],
     depths: Sequence[Float[np.ndarray, "h w"]],
     normals: Sequence[Float[np.ndarray, "h w 3"]],
+    unit: str = "map units",
 ) -> None:
     """Draw one row per keyframe: image, rendered depth (one colour scale for all) and normals.
 
@@ -114,7 +115,7 @@ def draw_keyframes(
             picture[top : top + height, left : left + _CELL] = fitted
     for column, title in enumerate(("image", "depth", "normals")):
         _write(picture, title, (column * (_CELL + _GAP) + 4, 19), 0.5)
-    _depth_bar(picture[:, width + 10 :], low, high)
+    _depth_bar(picture[:, width + 10 :], low, high, unit)
     save_picture(path, picture)
 
 
@@ -169,7 +170,7 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
             return np.repeat(grey[..., None], 3, -1)
 
 
-def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> None:
+def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float, unit: str) -> None:
     """Draw the colour bar of depth into a strip of the picture."""
     top = _HEAD + 20
     length = min(place.shape[0] - _HEAD - 40, 300)
@@ -177,7 +178,7 @@ def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> No
         return
     ramp = np.linspace(high, low, length)[:, None].repeat(14, 1)
     place[top : top + length, :14] = depth_colours(np.maximum(ramp, 1e-12), low, high)
-    _write(place, "map units", (0, top - 8), 0.38)
+    _write(place, unit, (0, top - 8), 0.38)
     for fraction in (0.0, 0.5, 1.0):
         value = f"{high + fraction * (low - high):.3g}"
         _write(place, value, (18, round(top + fraction * (length - 1)) + 4))
