@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from geogs.kernel_folder import find_kernel_folder
+from geogs.guard.kernel_folder import find_kernel_folder
 from geogs.version import __version__
 
 if TYPE_CHECKING:

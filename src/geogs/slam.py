@@ -9,12 +9,12 @@ from jaxtyping import Bool
 
 from geogs.config import Config
 from geogs.config.arguments import checks_arguments
-from geogs.entrance import Entrance, changes_system
 from geogs.errors import InputError
 from geogs.executors.in_order import Deferred, InOrder
 from geogs.executors.live import Live, urgent_stream
 from geogs.geometry.camera import Camera
 from geogs.gpu.installation import require_device
+from geogs.guard.entrance import Entrance, changes_system
 from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper

@@ -9,11 +9,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.config import Config
-from geogs.entrance import Entrance
 from geogs.errors import InputError
 from geogs.executors.in_order import InOrder
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
+from geogs.guard.entrance import Entrance
 from geogs.loop.closer import LoopCloser
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer, RenderedView

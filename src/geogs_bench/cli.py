@@ -5,7 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from geogs.cli.options import parse_options
-from geogs.terminal_text import printable, say
+from geogs.guard.terminal_text import printable, say
 from geogs_bench.bench_options import BenchOptions
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from geogs.documents import UNUSABLE, read_json
 from geogs.errors import GeogsError, InputError
-from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.guard.atomic import prepare_output_folder, write_text
+from geogs.guard.documents import UNUSABLE, read_json
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.machine import forget_peak_memory, machine_name, program_version

@@ -74,9 +74,9 @@ def write_thumbnail(output: Path) -> None:
     from PIL import Image
 
     from geogs.application.results.output_folder import claimed
+    from geogs.guard.atomic import atomic_file
+    from geogs.guard.replacement import replaced
     from geogs.io.pictures import decoded
-    from geogs.io.writers.atomic import atomic_file
-    from geogs.io.writers.replacement import replaced
 
     pictures = (decoded(output / "report" / name, cv2.IMREAD_COLOR).rgb for name in _PICTURES)
     rgb = next((picture for picture in pictures if picture is not None), None)
@@ -106,7 +106,7 @@ def _is_begun(output: Path, settings: RunSettings) -> bool:
 def _wait_for_others(output: Path) -> None:
     """Wait until an attempt that is about to end has left the folder. Raises OutputError if not."""
     from geogs.application.results.output_folder import only_writer
-    from geogs.io.writers.atomic import prepare_output_folder
+    from geogs.guard.atomic import prepare_output_folder
 
     prepare_output_folder(output)
     last = time.monotonic() + PATIENCE

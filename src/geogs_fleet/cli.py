@@ -7,7 +7,7 @@ from typing import TypeVar, cast
 from geogs.cli.options import Given, parse_options
 from geogs.config import Preset, preset
 from geogs.errors import InputError
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 
 Options = TypeVar("Options", bound=FleetOptions)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from rich.console import Console
 
 from geogs.evaluation.duration import duration
-from geogs.terminal_text import printable
+from geogs.guard.terminal_text import printable
 from geogs_fleet.table import Row
 
 

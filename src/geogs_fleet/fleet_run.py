@@ -15,7 +15,7 @@ from geogs.application.results.output_folder import only_writer
 from geogs.application.run_settings import RunSettings
 from geogs.config import Config
 from geogs.errors import GeogsError, InputError
-from geogs.io.writers.atomic import prepare_output_folder
+from geogs.guard.atomic import prepare_output_folder
 from geogs_fleet.attempt import CHILD, FleetJob, attempt
 from geogs_fleet.cluster import Allocation, allocation_for, as_task, ray_cluster
 from geogs_fleet.fleet_options import FleetOptions

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from geogs.application.results.output_folder import claimed
 from geogs.cli.options import record
 from geogs.config import Config
-from geogs.documents import read_json
 from geogs.errors import InputError
+from geogs.guard.documents import read_json
 from geogs_fleet.cluster import allocation_for, ray_cluster
 from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 from geogs_fleet.fleet_progress import FleetProgress

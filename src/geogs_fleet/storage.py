@@ -5,10 +5,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from geogs.documents import expanded, read_text
 from geogs.errors import GeogsError, InputError, OutputError
 from geogs.extras import install_command
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import expanded, read_text
 
 PATIENCE = 60.0
 """Seconds that a server may be silent; the whole transfer may take longer."""

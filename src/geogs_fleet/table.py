@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 from urllib.parse import quote
 
-from geogs.documents import UNUSABLE
 from geogs.evaluation.duration import duration
 from geogs.evaluation.pages.page import FiguresSection, HtmlSection, Section, write_page
+from geogs.guard.documents import UNUSABLE
 from geogs_fleet.storage import StoragePath
 
 State = Literal["done", "failed", "crashed"]

@@ -8,15 +8,15 @@ from pathlib import Path
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import ReconstructConfig
-from geogs.documents import UNUSABLE, expanded, read_json
 from geogs.errors import InputError
 from geogs.evaluation.duration import duration
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import UNUSABLE, expanded, read_json
+from geogs.guard.replacement import replaced
 from geogs.io.sources.formats.colmap import open_colmap
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.selection import selection_of
-from geogs.io.writers.atomic import write_text
-from geogs.io.writers.replacement import replaced
 from geogs.threads import worker_count
 from geogs_photos.photo_features import MAX_FEATURES
 from geogs_photos.photograph import PhotoFolder, find_photographs

@@ -10,9 +10,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
+from geogs.guard.documents import UNUSABLE, in_short
 from geogs_train.network_trainer import NetworkTrainer
 
 FILE = "checkpoint.safetensors"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from geogs.errors import GeogsError, InputError
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 from geogs_train.course import Worker
 from geogs_train.depth.depth_validation import DepthValidation
 from geogs_train.flow.flow_validation import SceneValidation

@@ -11,10 +11,10 @@ import torch
 
 from geogs.config import InputConfig
 from geogs.errors import GeogsError, InputError, OutputError
+from geogs.guard import atomic
+from geogs.guard.atomic import prepare_output_folder, write_text
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers import atomic
-from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.map_file import save_map
 from geogs.io.writers.ply_writer import write_mesh, write_splats
 from geogs.io.writers.trajectories import write_tum_trajectory

@@ -12,7 +12,7 @@ import geogs as geogs_package
 from geogs.cli import command
 from geogs.cli import main as cli
 from geogs.cli.command import COMMANDS, Command
-from geogs.kernel_folder import VARIABLE
+from geogs.guard.kernel_folder import VARIABLE
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 GEOGS = f"{sys.executable} -m geogs.cli.main"
@@ -100,7 +100,7 @@ def test_without_a_home_and_a_terminal():
 def test_where_only_results_can_be_written_a_scene_is_rendered(tmp_path):
     """Neither the program's folder, nor the home, nor /dev/shm: as in many containers.
 
-    Kernels are compiled anew; where they are kept is what tests/test_kernel_folder.py looks at.
+    Kernels are compiled anew; tests/guard/test_kernel_folder.py looks at where they are kept.
     """
     if subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False).returncode:
         pytest.skip("the system lets nobody change what is mounted")

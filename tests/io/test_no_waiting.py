@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from geogs.documents import open_file, require_file
 from geogs.errors import InputError
+from geogs.guard.documents import open_file, require_file
 from geogs.io.sources.sniff import open_posed_source, open_source
 from geogs.io.writers.map_file import load_map
 from geogs.networks.tensor_files import load_trained, read_tensors

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from geogs.errors import InputError
-from geogs.io.decoder_noise import decoder_noise
+from geogs.guard.decoder_noise import decoder_noise
 from geogs.io.pictures import DEEP, decoded, decoded_bytes, header_of
 from io_samples import empty_png, gradient_image, write_image
 

@@ -8,9 +8,9 @@ import torch
 
 from geogs.errors import InputError, OutputError
 from geogs.geometry.lie import quaternion_to_matrix, se3_exp
+from geogs.guard.atomic import atomic_file, prepare_output_folder, write_text
 from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_tum_trajectory
-from geogs.io.writers.atomic import atomic_file, prepare_output_folder, write_text
 from geogs.io.writers.map_file import load_map, save_map
 from geogs.io.writers.ply_writer import SPLAT_THICKNESS, write_mesh, write_splats
 from geogs.io.writers.trajectories import write_tum_trajectory

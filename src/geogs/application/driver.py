@@ -22,9 +22,9 @@ from geogs.application.results.write import write_files
 from geogs.application.run_settings import ReconstructSettings, RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.errors import DeviceError, OutputError
+from geogs.guard.replacement import replaced
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.writers.replacement import replaced
 from geogs.stopwatch import Stopwatch
 
 if TYPE_CHECKING:

@@ -26,9 +26,9 @@ from geogs.evaluation.trajectory_errors import (
     evaluate_trajectory,
 )
 from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
+from geogs.guard.replacement import is_half_done, replaced
 from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
-from geogs.io.writers.replacement import is_half_done, replaced
 from geogs.io.writers.uncertainty import read_states
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread

@@ -20,9 +20,9 @@ from geogs.errors import InputError
 from geogs.evaluation.pages.run_pictures import draw_keyframes
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.gpu.installation import require_device
+from geogs.guard.atomic import write_text
+from geogs.guard.replacement import replaced
 from geogs.io.sources.sniff import open_picture
-from geogs.io.writers.atomic import write_text
-from geogs.io.writers.replacement import replaced
 from geogs.pose_estimate import PoseEstimate
 from geogs.threads import on_one_torch_thread
 from geogs.types import Frame

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from geogs.config.leaves import Leaf, leaves, with_values
 from geogs.config.setting import NamesFile, Positional
-from geogs.documents import expanded
+from geogs.guard.documents import expanded
 from geogs.io.sources.address import live_address
 
 S = TypeVar("S")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from geogs.application.results.output_folder import read_summary
 from geogs.application.run_settings import RunSettings
-from geogs.documents import UNUSABLE
 from geogs.errors import InputError
 from geogs.evaluation.duration import duration
 from geogs.geometry.camera import Camera
+from geogs.guard.documents import UNUSABLE
 from geogs.io.sources.frame_source import Source
 from geogs.io.writers.intrinsics_file import read_camera
 

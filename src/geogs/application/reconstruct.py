@@ -30,9 +30,9 @@ from geogs.application.structure_from_motion.photos import open_photographs
 from geogs.config import ReconstructConfig
 from geogs.config.arguments import checks_arguments
 from geogs.config.idle import idle_settings
-from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
+from geogs.guard.documents import expanded
 from geogs.io.sources.posed.pose_check import PoseCheck, check_poses, with_focal_length
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import without_ending

@@ -22,17 +22,17 @@ from geogs.application.scale.known_length import (
     scale_source,
 )
 from geogs.application.scale.measurable_scene import SeenKeyframe, measurable
-from geogs.documents import UNUSABLE
 from geogs.errors import InputError
 from geogs.evaluation.true_scene import scaled
 from geogs.gpu.installation import require_device
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import UNUSABLE
+from geogs.guard.replacement import replaced
 from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration_files import read_calibration
-from geogs.io.writers.atomic import write_text
 from geogs.io.writers.map_file import MapViews, load_map_file, save_map, save_map_with_views
 from geogs.io.writers.ply_writer import SH_DEGREE_0, write_splats
-from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mesh.mesh_file import read_mesh

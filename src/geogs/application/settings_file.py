@@ -10,8 +10,8 @@ from geogs.application.named_files import with_absolute_paths
 from geogs.config import Config, ReconstructConfig
 from geogs.config.leaves import Leaf, former_words, leaves, with_values
 from geogs.config.setting import dashed
-from geogs.documents import in_short, read_yaml
 from geogs.errors import InputError
+from geogs.guard.documents import in_short, read_yaml
 
 T = TypeVar("T", Config, ReconstructConfig)
 

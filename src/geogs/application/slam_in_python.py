@@ -18,11 +18,11 @@ from geogs.config import Config
 from geogs.config.arguments import checks_arguments
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
+from geogs.guard.replacement import replaced
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map_with_views
-from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mesh.triangle_mesh import Mesh

@@ -9,7 +9,7 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 
 JSON = "--json"
 """Option of every command: one JSON object on the standard output, in place of sentences."""

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 
 SCRIPTS = {
     "bash": """\

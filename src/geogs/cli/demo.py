@@ -12,7 +12,7 @@ from geogs.cli.command import find_command
 from geogs.cli.options import parse_options
 from geogs.config import Seed
 from geogs.config.setting import Basic, Range, Settings
-from geogs.terminal_text import printable, say
+from geogs.guard.terminal_text import printable, say
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 
 
 @dataclass(frozen=True)

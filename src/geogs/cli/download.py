@@ -10,7 +10,7 @@ from geogs.application.run_settings import Verbosity
 from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
-from geogs.terminal_text import printable
+from geogs.guard.terminal_text import printable
 
 
 @dataclass(frozen=True)

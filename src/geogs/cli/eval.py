@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from geogs.application.result_settings import EvalSettings
 from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
-from geogs.terminal_text import printable, say
+from geogs.guard.terminal_text import printable, say
 
 
 def main(argv: Sequence[str]) -> Answer:
@@ -15,8 +15,8 @@ def main(argv: Sequence[str]) -> Answer:
     from rich.console import Console
 
     from geogs.application.evaluate import evaluate
-    from geogs.documents import read_json
     from geogs.evaluation.pages.evaluation_page import table
+    from geogs.guard.documents import read_json
 
     evaluation = evaluate(options)
     errors = evaluation.trajectory

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from geogs.application.result_settings import ExportSettings
 from geogs.cli.answer import Answer
 from geogs.cli.options import parse_options
-from geogs.terminal_text import printable
+from geogs.guard.terminal_text import printable
 
 
 def main(argv: Sequence[str]) -> Answer:

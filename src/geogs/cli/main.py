@@ -16,7 +16,7 @@ from geogs.cli.candidates import ASKED, matching
 from geogs.cli.command import all_commands, find_command
 from geogs.cli.terminal import process
 from geogs.errors import GeogsError
-from geogs.terminal_text import printable, say
+from geogs.guard.terminal_text import printable, say
 from geogs.version import __version__
 
 EXIT_ERROR = 2
@@ -60,7 +60,7 @@ def _answered(arguments: list[str]) -> int:
 
     with record.listening():
         code = _guarded(lambda: _dispatch(rest), record.take, fail)
-    print(record.text(rest[0] if rest else "", code))
+    say(record.text(rest[0] if rest else "", code))
     return code
 
 

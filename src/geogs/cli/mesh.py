@@ -6,7 +6,7 @@ from pathlib import Path
 from geogs.application.result_settings import RemeshSettings
 from geogs.cli.answer import Answer
 from geogs.cli.options import Given, parse_options
-from geogs.terminal_text import printable
+from geogs.guard.terminal_text import printable
 
 
 def main(argv: Sequence[str]) -> Answer:

@@ -17,7 +17,7 @@ from geogs.cli.help import first_clause, help_text
 from geogs.config.leaves import Leaf, default_of, former_words, leaves
 from geogs.config.setting import Positional, dashed, group_of, refusal
 from geogs.errors import InputError
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 
 _log = logging.getLogger(__name__)
 Options = TypeVar("Options")

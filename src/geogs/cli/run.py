@@ -22,8 +22,8 @@ from geogs.cli.terminal.speech import dry_answer, followed, say_loading
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
+from geogs.guard.terminal_text import say
 from geogs.io.sources.address import live_address
-from geogs.terminal_text import say
 
 if TYPE_CHECKING:
     from geogs.application.machine.compilation import Compilation

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from geogs.application.result_settings import ViewSettings
 from geogs.cli.options import parse_options
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 
 
 def main(argv: Sequence[str]) -> int:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
 from geogs.errors import InputError
+from geogs.guard.terminal_text import say
 from geogs.networks.weights_files import (
     CATALOGUE,
     KnownWeights,
@@ -17,7 +18,6 @@ from geogs.networks.weights_files import (
     require_intact,
     weights_folders,
 )
-from geogs.terminal_text import say
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from geogs.errors import DeviceError
 from geogs.gpu.binaries import FOLDER, MACHINE_CODE, PTX, name_of
 from geogs.gpu.kernel_source import OPTIONS, PACKAGE, kernel_sources, read_source
 from geogs.gpu.nvrtc import Nvrtc, load_nvrtc
-from geogs.terminal_text import say
+from geogs.guard.terminal_text import say
 
 CUDA = "13"
 """Major version; its drivers, and all later ones, load its code."""

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_bytes
 from geogs.errors import InputError
+from geogs.guard.documents import read_bytes
 
 LARGEST_ARRAY = 1 << 30
 """Largest size of an unpacked array in bytes; those of DTU have 60 MB."""

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from geogs.documents import open_file, read_bytes
 from geogs.errors import InputError
-from geogs.io.decoder_noise import decoder_noise
+from geogs.guard.decoder_noise import decoder_noise
+from geogs.guard.documents import open_file, read_bytes
 
 LARGEST_PICTURE = 1 << 31
 """Largest file in bytes."""

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-from geogs.documents import in_short, read_bytes
 from geogs.errors import InputError
+from geogs.guard.documents import in_short, read_bytes
 
 _KINDS = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",

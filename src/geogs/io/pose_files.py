@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from geogs.documents import first_file, numbered, read_text
 from geogs.errors import InputError
 from geogs.geometry.lie import quaternion_to_matrix
+from geogs.guard.documents import first_file, numbered, read_text
 from geogs.types import Trajectory
 
 FRAMES_PER_SECOND = 30.0

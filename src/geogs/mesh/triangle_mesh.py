@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
-from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.creases import creased
+from geogs.guard.documents import expanded
 from geogs.mesh.tensor_mesh import TensorMesh
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Mesh:
             InputError: it ends otherwise.
             OutputError: it cannot be written.
         """
-        from geogs.io.writers.atomic import atomic_file
+        from geogs.guard.atomic import atomic_file
         from geogs.io.writers.exports.mesh_writers import glb, write_obj, write_stl
         from geogs.io.writers.exports.usdz_writer import write_usdz
         from geogs.io.writers.ply_writer import write_mesh

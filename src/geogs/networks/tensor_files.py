@@ -11,8 +11,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from geogs.documents import in_short, open_file, require_file
 from geogs.errors import InputError
+from geogs.guard.documents import in_short, open_file, require_file
 from geogs.networks.weights_files import require_intact
 
 N = TypeVar("N", bound=nn.Module)

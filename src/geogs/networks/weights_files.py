@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from geogs.documents import open_file
 from geogs.errors import InputError
 from geogs.gpu.cache import cache_folder
+from geogs.guard.documents import open_file
 
 PACKAGED = Path(__file__).parents[1] / "data" / "weights"
 """Weights that come with the package, and their ``SHA256SUMS``."""

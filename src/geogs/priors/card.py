@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from geogs.config.setting import Count, CountOrZero, Kind, Positive, Range, kinds
-from geogs.documents import read_yaml
 from geogs.errors import InputError
+from geogs.guard.documents import read_yaml
 from geogs.priors.monocular_prior import DepthKind
 
 _CARDS = Path(__file__).parent / "cards"

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from geogs.documents import in_short, require_file
 from geogs.errors import InputError
 from geogs.extras import install_command
 from geogs.geometry.camera import Camera
+from geogs.guard.documents import in_short, require_file
 from geogs.priors.card import PriorCard
 from geogs.priors.monocular_prior import DepthKind, PriorMaps
 from geogs.threads import worker_count

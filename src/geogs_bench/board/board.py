@@ -15,12 +15,12 @@ import numpy as np
 
 from geogs.application.evaluate import evaluate
 from geogs.application.result_settings import EvalSettings
-from geogs.documents import read_json
 from geogs.errors import GeogsError, InputError
 from geogs.evaluation.pages.evaluation_page import Evaluation
 from geogs.evaluation.surfaces.reconstruction_errors import ReconstructionScores
 from geogs.gpu.installation import require_device
-from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.guard.atomic import prepare_output_folder, write_text
+from geogs.guard.documents import read_json
 from geogs.threads import available_cores
 from geogs_bench.bench_options import BenchOptions
 from geogs_bench.board.board_record import BoardRecord, Outcome, RowRecord, read_board, write_board

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, read_json
 from geogs_bench.results.record import read_dataclass, write_json
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from geogs.errors import OutputError
 from geogs.evaluation.true_scene import read_true_scene
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
 from geogs_bench.board.commands import run_geogs
 from geogs_synth.camera.flaws import CameraKind
 from geogs_synth.motion.motion_kinds import MotionKind

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
 from geogs_bench.bench_options import BenchOptions
 from geogs_bench.board.board import Board, opened_board
 from geogs_bench.board.comparison import Difference, compare

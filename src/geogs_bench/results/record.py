@@ -6,9 +6,9 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import UNUSABLE, read_json
 
 T = TypeVar("T")
 

@@ -13,9 +13,9 @@ from geogs.config import MeshConfig
 from geogs.errors import DeviceError, InputError
 from geogs.extras import install_command
 from geogs.gpu.installation import require_device
+from geogs.guard.atomic import prepare_output_folder, write_text
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
-from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.mesh.extract import extract_mesh

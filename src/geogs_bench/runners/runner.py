@@ -25,8 +25,8 @@ from geogs.cli import run as run_command
 from geogs.cli.options import record
 from geogs.errors import InputError, TrackingLost
 from geogs.gpu.installation import require_device
+from geogs.guard.atomic import prepare_output_folder, write_text
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle

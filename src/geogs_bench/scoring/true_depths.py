@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from geogs.config import InputConfig
-from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.camera import Camera
+from geogs.guard.documents import read_json
 from geogs.io.pictures import decoded
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source

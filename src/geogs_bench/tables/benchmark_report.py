@@ -12,7 +12,7 @@ from geogs.evaluation.pages.page import (
     write_page,
 )
 from geogs.evaluation.pages.plots import new_figure, save_figure
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
 from geogs_bench.benchmark import Benchmark, Column, Layout
 from geogs_bench.published import PAPER, PublishedTable
 from geogs_bench.results.record import Record, write_json

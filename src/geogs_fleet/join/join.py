@@ -17,10 +17,10 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import state_spans
 from geogs.config import Config
 from geogs.errors import InputError
-from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.guard.atomic import prepare_output_folder, write_text
+from geogs.guard.replacement import replaced
 from geogs.io.writers.map_file import load_map_file
 from geogs.io.writers.ply_writer import write_splats
-from geogs.io.writers.replacement import replaced
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot

@@ -13,11 +13,11 @@ from torch import Tensor
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.write import write_config
 from geogs.config import Config
-from geogs.documents import read_bytes
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse, sim3_scale, so3_exp, so3_log
+from geogs.guard.atomic import atomic_file, write_text
+from geogs.guard.documents import read_bytes
 from geogs.io.sources.frame_source import PAUSE, RecordingSpan
-from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.keyframe_folder import image_path, rows_path, write_image, write_rows
 from geogs.io.writers.map_file import MapViews, save_map_with_views

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from geogs.application.results.saved_result import load_result
 from geogs.config import MeshConfig
-from geogs.documents import open_file
 from geogs.geometry.camera import Camera
+from geogs.guard.documents import open_file
 from geogs.io.writers.keyframe_folder import image_path, read_image
 from geogs.mesh.blocks import (
     MeshBlock,

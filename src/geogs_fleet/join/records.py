@@ -7,7 +7,7 @@ from typing import TypeVar
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from geogs.documents import require_file
+from geogs.guard.documents import require_file
 from geogs.world.pack import pack, unpack
 
 R = TypeVar("R")

@@ -15,8 +15,8 @@ from jaxtyping import Float32, Float64
 
 from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
+from geogs.guard.atomic import atomic_file, prepare_output_folder, write_text
 from geogs.io.pose_files import FRAMES_PER_SECOND
-from geogs.io.writers.atomic import atomic_file, prepare_output_folder, write_text
 from geogs.io.writers.ply_writer import write_mesh, write_points
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory

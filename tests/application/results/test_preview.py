@@ -11,7 +11,7 @@ from geogs.application.results.surfaces import PREVIEW, preview
 from geogs.application.run import run
 from geogs.application.run_settings import RunSettings
 from geogs.config import InputConfig
-from geogs.io.writers.replacement import replaced
+from geogs.guard.replacement import replaced
 from geogs.mesh.mesh_file import read_mesh
 from quick_systems import quick_config
 

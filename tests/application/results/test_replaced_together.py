@@ -217,7 +217,7 @@ def test_a_command_that_is_killed_is_undone_or_completed_by_the_next(
     commands[command](folder)
     new = contents(folder)
     old, completed = begun(command), 0
-    # Every point is tried in tests/io/test_replacement.py; here, that commands go that way.
+    # Every point is tried in tests/guard/test_replacement.py; here, that commands go that way.
     step = 7 if command in ("run", "export colmap") else 2
     for _ in every_fault(kill, folder, lambda: commands[command](folder), step):
         load_result(folder)

@@ -15,13 +15,13 @@ from geogs.application.results.surfaces import fusion_views
 from geogs.cli.main import main
 from geogs.config import MeshConfig
 from geogs.errors import InputError
+from geogs.guard.atomic import write_text
+from geogs.guard.replacement import replaced
 from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_tum_trajectory
-from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map
 from geogs.io.writers.ply_writer import write_splats
-from geogs.io.writers.replacement import replaced
 from geogs.mesh.extract import extract_mesh
 from saved_results import BLOCK, CAMERA, ORIGIN, UNIT, WALL, make_result
 

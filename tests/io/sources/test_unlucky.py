@@ -7,9 +7,9 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.guard.atomic import write_text
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers.atomic import write_text
 from io_samples import gradient_image, write_image, write_images, write_video
 
 GIVEN = InputConfig(intrinsics="50,50,31.5,23.5")

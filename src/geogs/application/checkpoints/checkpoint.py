@@ -20,9 +20,9 @@ from safetensors.torch import load, save
 from geogs.application.checkpoints.folder import FORMAT, CheckpointFolder
 from geogs.application.machine.device import is_gpu_failure
 from geogs.application.progress.run_progress import RunProgress
-from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError, OutputError
-from geogs.io.writers.directory import identity
+from geogs.guard.directory import identity
+from geogs.guard.documents import UNUSABLE, in_short
 from geogs.stopwatch import Stopwatch
 from geogs.version import __version__
 from geogs.world.archive import Archive, SettledArchive

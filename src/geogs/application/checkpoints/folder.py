@@ -22,9 +22,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from geogs.documents import UNUSABLE
 from geogs.errors import InputError, OutputError
 from geogs.gpu.cache import cache_folder
+from geogs.guard.documents import UNUSABLE
 from geogs.version import __version__
 from geogs.world.arrays import NOT_STORED
 from geogs.world.pack import pack, unpack

@@ -17,8 +17,8 @@ from typing import IO, TypeVar
 from geogs.application.download.sequences import PublicSequence
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed
-from geogs.documents import in_short
 from geogs.errors import GeogsError, InputError, OutputError
+from geogs.guard.documents import in_short
 
 
 def download(sequence: PublicSequence, into: Path, progress: RunProgress | None = None) -> Path:

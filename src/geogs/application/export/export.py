@@ -23,17 +23,17 @@ from geogs.application.results.result_page import result_lengths
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.application.results.upright import tracked_poses
-from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import read_json
+from geogs.guard.replacement import replaced
 from geogs.io.writers.exports.gsplat import write_gsplat_start
 from geogs.io.writers.exports.las import write_las
 from geogs.io.writers.exports.line_drawing import write_drawing
 from geogs.io.writers.exports.mesh_writers import write_textured_glb
 from geogs.io.writers.exports.usdz_writer import write_usdz
 from geogs.io.writers.ply_writer import write_points, write_splats
-from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_euroc, write_kitti, write_tum_trajectory
 from geogs.mesh.decimation.decimate import with_at_most
 from geogs.mesh.texture.textured import texture_mesh

@@ -11,10 +11,10 @@ from jaxtyping import Bool
 from geogs.application.export.originals import keyframe_images
 from geogs.application.export.seen_points import seen_points
 from geogs.application.results.saved_result import SavedResult
-from geogs.documents import read_bytes
 from geogs.geometry.camera import Camera
+from geogs.guard.atomic import atomic_file
+from geogs.guard.documents import read_bytes
 from geogs.io.sources.frame_source import Source
-from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.colmap_writer import write_colmap_model
 from geogs.io.writers.exports.exported import ExportedImage
 from geogs.io.writers.exports.maps import (

@@ -8,8 +8,8 @@ from jaxtyping import UInt8
 
 from geogs.application.results.saved_result import SavedResult
 from geogs.config import InputConfig
-from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, read_yaml
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 

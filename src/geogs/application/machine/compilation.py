@@ -1,7 +1,7 @@
 """Kernels for the CPU, compiled once per machine, by other processes while a run starts.
 
 ``python -m geogs.application.machine.compilation`` compiles them at once. Numba keeps them where
-:mod:`geogs.kernel_folder` says; files beside them record the versions they were made of.
+:mod:`geogs.guard.kernel_folder` says; files beside them record the versions they were made of.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from geogs.gpu.kernel_source import PACKAGE
-from geogs.kernel_folder import kernel_folder
+from geogs.guard.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
 PARTS = "search", "train", "mesh"

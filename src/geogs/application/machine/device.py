@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
-from geogs.documents import in_short
 from geogs.errors import DeviceError
 from geogs.gpu.kernel_source import PACKAGE
 from geogs.gpu.kernels import prepare_kernels
+from geogs.guard.documents import in_short
 
 REMEDY = (
     "use fewer images (--stride), a smaller --long-edge, a GPU with more memory, or --device cpu"

@@ -17,7 +17,7 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.application.run_settings import Verbosity
 from geogs.errors import OutputError
 from geogs.evaluation.duration import duration
-from geogs.terminal_text import escape_records, printable
+from geogs.guard.terminal_text import escape_records, printable
 
 if TYPE_CHECKING:
     from geogs.pose_estimate import PoseEstimate

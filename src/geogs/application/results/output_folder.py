@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from geogs.application.progress.run_progress import RunProgress
-from geogs.documents import expanded, in_short, read_json
 from geogs.errors import InputError, OutputError
-from geogs.io.writers.atomic import prepare_output_folder
-from geogs.io.writers.replacement import is_half_done, recover
+from geogs.guard.atomic import prepare_output_folder
+from geogs.guard.documents import expanded, in_short, read_json
+from geogs.guard.replacement import is_half_done, recover
 
 LOCK = ".geogs.lock"
 """Name of the lock file."""

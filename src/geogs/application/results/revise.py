@@ -10,10 +10,10 @@ from geogs.application.results.result_page import write_page_anew
 from geogs.application.results.saved_result import load_result, result_folder
 from geogs.application.results.surfaces import fused
 from geogs.config import MeshConfig
-from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.writers.replacement import replaced
+from geogs.guard.documents import UNUSABLE, read_yaml
+from geogs.guard.replacement import replaced
 
 
 def mesh_settings(folder: Path) -> MeshConfig:

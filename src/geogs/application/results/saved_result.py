@@ -17,12 +17,13 @@ from geogs.application.results.upright import upright
 from geogs.application.results.verdict import Verdict
 from geogs.camera.shutter.rows import CELL
 from geogs.config.arguments import checks_arguments
-from geogs.documents import UNUSABLE, expanded
 from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import Level
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.geometry.lie import se3_inverse
+from geogs.guard.documents import UNUSABLE, expanded
+from geogs.guard.replacement import is_half_done
 from geogs.io.pictures import upright_size
 from geogs.io.pose_files import read_frame_poses
 from geogs.io.writers.keyframe_folder import (
@@ -34,7 +35,6 @@ from geogs.io.writers.keyframe_folder import (
     rows_path,
 )
 from geogs.io.writers.map_file import MapViews, load_map_views
-from geogs.io.writers.replacement import is_half_done
 from geogs.io.writers.uncertainty import read_states
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.rendered import MapRenderer, RenderedView, SurfaceRules

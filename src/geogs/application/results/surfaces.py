@@ -12,8 +12,8 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.guard.replacement import replaced
 from geogs.io.writers.map_file import save_map
-from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh

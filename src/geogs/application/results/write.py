@@ -14,12 +14,12 @@ from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.application.settings_file import settings_text
 from geogs.config import Config, ReconstructConfig
 from geogs.evaluation.pages.run_page import lengths
+from geogs.guard.atomic import write_text
+from geogs.guard.replacement import replaced
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map_with_views
 from geogs.io.writers.ply_writer import write_splats
-from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread

@@ -16,7 +16,7 @@ from types import FrameType
 from typing import TextIO
 
 from geogs.application.interrupt import handled_signals, interrupt
-from geogs.terminal_text import escape_records
+from geogs.guard.terminal_text import escape_records
 
 
 def take_over() -> None:

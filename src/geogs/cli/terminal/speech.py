@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from geogs.application.run_settings import RunSettings, Verbosity
 from geogs.cli.answer import EXIT_NOT_RELIABLE, Answer
 from geogs.errors import TrackingLost
-from geogs.terminal_text import printable, say
+from geogs.guard.terminal_text import printable, say
 
 if TYPE_CHECKING:
     from geogs.application.interrupt import Stop

@@ -21,7 +21,7 @@ from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.photoconsistency import PhotoScores
 from geogs.evaluation.surfaces.surface_errors import SurfaceScores
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -10,7 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
 
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from geogs.evaluation.pages.shading import GREY, Viewpoint, look
 from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
 from geogs.threads import thread_map
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from geogs.documents import UNUSABLE
 from geogs.evaluation.duration import duration
 from geogs.evaluation.model_view.model_section import model_section
 from geogs.evaluation.model_view.shown_model import Lengths, ShownModel
@@ -16,6 +15,7 @@ from geogs.evaluation.pages.page import (
     TableSection,
     write_page,
 )
+from geogs.guard.documents import UNUSABLE
 
 PICTURES = {"keyframes.png": "Rendered keyframes", "trajectory.png": "Trajectory"}
 """Titles of the pictures that a run leaves in ``report/``, in the order of the page."""

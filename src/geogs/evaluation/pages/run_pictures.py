@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
 from geogs.types import RenderedKeyframe, Trajectory
 
 Layer = Literal["image", "depth", "normal", "confidence"]

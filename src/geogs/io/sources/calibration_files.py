@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from geogs.camera.distortion import LensModel
-from geogs.documents import (
+from geogs.errors import InputError
+from geogs.guard.documents import (
     LARGEST_SETTINGS,
     UNUSABLE,
     read_json,
@@ -23,7 +24,6 @@ from geogs.documents import (
     whole_number,
     yaml_value,
 )
-from geogs.errors import InputError
 from geogs.io.pictures import header_of
 from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import read_text, whole_number
 from geogs.errors import InputError
+from geogs.guard.documents import read_text, whole_number
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.camera_keys import MOST_SKEW
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.config import InputConfig
-from geogs.documents import LARGEST_SETTINGS, first_file, open_file, read_json
 from geogs.errors import InputError
+from geogs.guard.documents import LARGEST_SETTINGS, first_file, open_file, read_json
 from geogs.io.sources.account import Account
 from geogs.io.sources.depth_files import DepthFile, DepthUnit, RecordedDepth
 from geogs.io.sources.reader import RecordingInfo

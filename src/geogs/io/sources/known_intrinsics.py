@@ -5,8 +5,8 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from geogs.documents import first_file
 from geogs.errors import InputError
+from geogs.guard.documents import first_file
 from geogs.io.pictures import header_read, size_and_turns
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import (

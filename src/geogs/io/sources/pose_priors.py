@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
+from geogs.guard.documents import expanded
 from geogs.io.pose_files import is_rigid, read_tum_trajectory
 from geogs.io.sources.account import Account
 from geogs.io.sources.reader import RecordingInfo

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from geogs.config import InputConfig
 from geogs.config.arguments import checks_arguments
-from geogs.documents import expanded, require_file
 from geogs.errors import InputError
+from geogs.guard.documents import expanded, require_file
 from geogs.io.sources.address import LiveAddress, live_address
 from geogs.io.sources.formats import (
     bundler,

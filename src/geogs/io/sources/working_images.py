@@ -20,9 +20,9 @@ from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.camera.shutter.rows import RowOffsets
 from geogs.camera.shutter.shutter import Shutter
 from geogs.config import InputConfig
-from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.guard.documents import expanded
 from geogs.io.pictures import read_mask
 from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from geogs.camera.shutter.shutter import Shutter
-from geogs.documents import UNUSABLE, read_json, whole_number
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import UNUSABLE, read_json, whole_number
 from geogs.io.sources.calibration import Calibration
-from geogs.io.writers.atomic import write_text
 
 _MOST_PIXELS = 1 << 28
 

@@ -11,10 +11,10 @@ from jaxtyping import Bool, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
-from geogs.documents import UNUSABLE
 from geogs.errors import InputError
+from geogs.guard.atomic import atomic_file
+from geogs.guard.documents import UNUSABLE
 from geogs.io.pictures import decoded
-from geogs.io.writers.atomic import atomic_file
 from geogs.types import SeenRows
 
 JPEG_QUALITY = 95

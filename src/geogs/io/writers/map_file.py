@@ -14,10 +14,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from geogs.config.arguments import checks_arguments
-from geogs.documents import UNUSABLE, require_file
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
+from geogs.guard.documents import UNUSABLE, require_file
 from geogs.io.writers.intrinsics_file import camera_of
 from geogs.limits import POSITIVE, RIGID, holds
 from geogs.short_repr import ShortRepr

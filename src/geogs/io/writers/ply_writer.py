@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
 from geogs.types import MapSnapshot
 
 SPLAT_THICKNESS = 0.01

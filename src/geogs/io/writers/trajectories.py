@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import matrix_to_quaternion
+from geogs.guard.atomic import write_text
 from geogs.io.pose_files import ORIENTATIONS
-from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory
 
 _EUROC = (

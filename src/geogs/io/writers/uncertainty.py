@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_text
 from geogs.errors import InputError
-from geogs.io.writers.atomic import write_text
+from geogs.guard.atomic import write_text
+from geogs.guard.documents import read_text
 from geogs.types import Trajectory, Uncertainty
 
 HEADER = "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth"

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from geogs.documents import in_short
 from geogs.errors import InputError
+from geogs.guard.documents import in_short
 from geogs.tracking.flow.lookup import VOLUME_LEVELS, WINDOW
 from geogs.tracking.flow.network_parts import cell_positions, two_convolutions
 from geogs.world.grid import OFFSET, STRIDE

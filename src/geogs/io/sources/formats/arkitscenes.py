@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from geogs.documents import UNUSABLE, first_file
 from geogs.errors import InputError
 from geogs.geometry.lie import so3_exp
+from geogs.guard.documents import UNUSABLE, first_file
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import arkit_camera

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import UNUSABLE, first_file
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, first_file
 from geogs.io.pose_files import is_rigid, quaternion_trajectory, read_rows
 from geogs.io.sources.calibration_files import calibration_from_document, camera_document
 from geogs.io.sources.formats.image_files import (

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from geogs.documents import first_file, read_bytes, read_text
 from geogs.errors import InputError
 from geogs.geometry.lie import quaternion_to_matrix
+from geogs.guard.documents import first_file, read_bytes, read_text
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration_files import COLMAP_MODELS, calibration_from_colmap

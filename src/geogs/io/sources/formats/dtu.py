@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import open_file
 from geogs.errors import InputError
+from geogs.guard.documents import open_file
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.image_files import SUFFIXES, natural_key

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from geogs.documents import read_text
 from geogs.errors import InputError
+from geogs.guard.documents import read_text
 from geogs.io.pictures import DEEP, decoded, stored_size_and_turns, upright_size
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.account import Account, named

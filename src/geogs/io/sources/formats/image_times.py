@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import read_text
 from geogs.errors import InputError
+from geogs.guard.documents import read_text
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.account import Account
 from geogs.io.sources.reader import median_rate

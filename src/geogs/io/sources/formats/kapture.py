@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_text
+from geogs.guard.documents import read_text
 from geogs.io.sources.account import Account
 from geogs.io.sources.calibration_files import calibration_from_colmap
 from geogs.io.sources.formats.colmap import pose_from

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import UNUSABLE, first_file, numbered
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, first_file, numbered
 from geogs.io.pose_files import columns_of, is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_camera, kitti_offset

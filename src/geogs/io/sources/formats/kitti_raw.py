@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import first_file, read_text
 from geogs.errors import InputError
+from geogs.guard.documents import first_file, read_text
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_offset, kitti_rows

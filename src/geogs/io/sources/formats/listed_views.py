@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import UNUSABLE, in_short, open_file
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, in_short, open_file
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration import Calibration

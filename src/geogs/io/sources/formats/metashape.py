@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import read_xml
+from geogs.guard.documents import read_xml
 from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.listed_views import (

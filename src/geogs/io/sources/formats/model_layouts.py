@@ -10,8 +10,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.documents import first_file, numbered
 from geogs.errors import InputError
+from geogs.guard.documents import first_file, numbered
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import depth_beside

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_text
+from geogs.guard.documents import read_text
 from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.image_files import has_images

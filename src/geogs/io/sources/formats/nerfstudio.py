@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import UNUSABLE, first_file, read_json
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, first_file, read_json
 from geogs.io.pictures import stored_size_and_turns
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.account import Account, named

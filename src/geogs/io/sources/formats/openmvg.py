@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from geogs.camera.distortion import LensModel
-from geogs.documents import LARGEST_TEXT, read_bytes, read_json
+from geogs.guard.documents import LARGEST_TEXT, read_bytes, read_json
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.listed_views import (
     SizedCamera,

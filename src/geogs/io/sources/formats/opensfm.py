@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from geogs.camera.distortion import LensModel
-from geogs.documents import LARGEST_TEXT, read_json
 from geogs.errors import InputError
+from geogs.guard.documents import LARGEST_TEXT, read_json
 from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.listed_views import (

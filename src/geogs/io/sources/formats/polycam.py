@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, read_json
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import depth_beside

@@ -17,8 +17,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import read_text, read_xml
 from geogs.errors import InputError
+from geogs.guard.documents import read_text, read_xml
 from geogs.io.pose_files import OPENCV_FROM_OPENGL
 from geogs.io.sources.account import Account
 from geogs.io.sources.calibration import Calibration

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes, require_file
 from geogs.errors import InputError
 from geogs.extras import install_command
+from geogs.guard.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes, require_file
 from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL, poses_from
 from geogs.io.sources.calibration import Calibration

@@ -5,8 +5,8 @@
 
 from pathlib import Path
 
-from geogs.documents import UNUSABLE, numbered, read_json
 from geogs.errors import InputError
+from geogs.guard.documents import UNUSABLE, numbered, read_json
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.data_set_cameras import record3d_camera
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import first_file, numbered
 from geogs.errors import InputError
+from geogs.guard.documents import first_file, numbered
 from geogs.io.pose_files import FRAMES_PER_SECOND, read_replica_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration

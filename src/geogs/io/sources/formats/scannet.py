@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import numbered, read_text
 from geogs.errors import InputError
+from geogs.guard.documents import numbered, read_text
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration

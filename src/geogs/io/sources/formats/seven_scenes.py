@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import numbered
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.guard.documents import numbered
 from geogs.io.pose_files import FRAMES_PER_SECOND, read_seven_scenes_poses
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthCamera, DepthFile

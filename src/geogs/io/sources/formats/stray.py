@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import numbered, read_text
 from geogs.errors import InputError
+from geogs.guard.documents import numbered, read_text
 from geogs.io.pose_files import poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import PHONE, DepthFile

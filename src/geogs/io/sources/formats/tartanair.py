@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import numbered
 from geogs.errors import InputError
+from geogs.guard.documents import numbered
 from geogs.io.pose_files import FRAMES_PER_SECOND, quaternion_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, Place, images_in

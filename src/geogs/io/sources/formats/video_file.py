@@ -13,8 +13,8 @@ import numpy as np
 from av.container import InputContainer
 from jaxtyping import UInt8
 
-from geogs.documents import require_file
 from geogs.errors import InputError
+from geogs.guard.documents import require_file
 from geogs.io.pictures import most_pixels
 from geogs.io.sources.account import Account
 from geogs.io.sources.reader import RawFrame, RecordingInfo, size_of

@@ -10,9 +10,9 @@ import av
 from av.container import InputContainer
 
 from geogs.errors import InputError
+from geogs.guard.same_host import SameHost
 from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.live.live_reader import Latest
-from geogs.io.sources.live.same_host import SameHost
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 from geogs.io.sources.video_limits import check_decodable, nominal_rate, video_formats
 

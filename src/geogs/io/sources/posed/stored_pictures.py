@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from geogs.documents import open_file
 from geogs.errors import InputError
+from geogs.guard.documents import open_file
 from geogs.io.pictures import DEEP, decoded, header_of, stored_size_and_turns
 from geogs.io.sources.pose_priors import turned_upright
 from geogs.io.sources.posed.posed_set import PosedFile

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from geogs.documents import (
+from geogs.errors import GeogsError, InputError
+from geogs.extras import install_command
+from geogs.guard.documents import (
     LARGEST_DOCUMENT,
     UNUSABLE,
     open_file,
@@ -17,8 +19,6 @@ from geogs.documents import (
     require_file,
     yaml_value,
 )
-from geogs.errors import GeogsError, InputError
-from geogs.extras import install_command
 from geogs.io.sources.account import Account, named
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.reader import RawFrame, RecordingInfo, median_rate

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion
-from geogs.io.writers.atomic import atomic_file, write_text
+from geogs.guard.atomic import atomic_file, write_text
 from geogs.io.writers.exports.exported import ExportedImage, SeenPoints
 
 _PINHOLE = 1

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
 from geogs.io.writers.ply_writer import SH_DEGREE_0, splat_scales
 from geogs.types import MapSnapshot
 

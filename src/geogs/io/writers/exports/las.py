@@ -7,7 +7,7 @@ from jaxtyping import Float64, UInt8
 
 from geogs.errors import InputError
 from geogs.extras import install_command
-from geogs.io.writers.atomic import atomic_file
+from geogs.guard.atomic import atomic_file
 
 _STEPS = 1e9
 """Steps of a coordinate over the extent, within the 32 bits of LAS."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from geogs.io.writers.atomic import atomic_file, write_text
+from geogs.guard.atomic import atomic_file, write_text
 
 _SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
 """Scales of a drawing on paper, as 1 to so many."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from geogs.geometry.camera import Camera
-from geogs.io.writers.atomic import atomic_file, write_text
+from geogs.guard.atomic import atomic_file, write_text
 from geogs.io.writers.intrinsics_file import pinhole
 from geogs.io.writers.keyframe_folder import write_picture
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 
+from geogs.guard.atomic import atomic_file
 from geogs.io.pose_files import OPENCV_FROM_OPENGL
-from geogs.io.writers.atomic import atomic_file
 
 _QUALITY = 92
 """Quality of the JPEG in a textured mesh."""

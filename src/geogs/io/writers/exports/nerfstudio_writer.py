@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from geogs.geometry.camera import Camera
+from geogs.guard.atomic import write_text
 from geogs.io.pose_files import OPENCV_FROM_OPENGL
-from geogs.io.writers.atomic import write_text
 from geogs.io.writers.exports.exported import ExportedImage
 
 DEPTH_UNIT = 1e-3

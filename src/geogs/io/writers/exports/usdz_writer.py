@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from geogs.guard.atomic import atomic_file
 from geogs.io.pose_files import OPENCV_FROM_OPENGL
-from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.mesh_writers import encoded_jpeg, linear
 
 _TEXTURE = "texture.jpg"

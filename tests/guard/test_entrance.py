@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import geogs
-from geogs.entrance import Entrance, changes_system
 from geogs.errors import InputError
+from geogs.guard.entrance import Entrance, changes_system
 from quick_systems import quick_config
 from tracking_scenes import render, sideways
 

@@ -5,8 +5,15 @@ import time
 
 import pytest
 
-from geogs.documents import expanded, read_bytes, read_json, read_text, read_yaml, whole_number
 from geogs.errors import InputError
+from geogs.guard.documents import (
+    expanded,
+    read_bytes,
+    read_json,
+    read_text,
+    read_yaml,
+    whole_number,
+)
 from mutations import BOMB
 
 

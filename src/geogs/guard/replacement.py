@@ -32,10 +32,10 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Literal
 
-from geogs.documents import UNUSABLE
 from geogs.errors import OutputError
-from geogs.io.writers.atomic import unwritable, write_text
-from geogs.io.writers.directory import Directory
+from geogs.guard.atomic import unwritable, write_text
+from geogs.guard.directory import Directory
+from geogs.guard.documents import UNUSABLE
 
 LIST = ".geogs.json"
 """Name of the list of a result's files."""

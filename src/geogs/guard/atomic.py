@@ -9,8 +9,8 @@ from secrets import token_hex
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
-from geogs.documents import expanded
 from geogs.errors import OutputError
+from geogs.guard.documents import expanded
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 

@@ -7,8 +7,8 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, build_opener
 
-from geogs.documents import in_short
 from geogs.errors import InputError
+from geogs.guard.documents import in_short
 
 
 class SameHost:

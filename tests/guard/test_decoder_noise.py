@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 
-from geogs.io.decoder_noise import decoder_noise
+from geogs.guard.decoder_noise import decoder_noise
 from geogs.io.pictures import decoded
 from io_samples import gradient_image, write_image
 

@@ -16,7 +16,7 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from geogs.errors import InputError
-from geogs.terminal_text import printable
+from geogs.guard.terminal_text import printable
 
 LARGEST_TEXT = 1 << 30
 """Bytes of a table, such as the poses of a long sequence or the points of a COLMAP model."""

@@ -10,9 +10,9 @@ import pytest
 
 from disk_faults import contents, every_fault, full_disk, kill
 from geogs.errors import OutputError
-from geogs.io.writers.atomic import prepare_output_folder, unwritable, write_text
-from geogs.io.writers.directory import Directory
-from geogs.io.writers.replacement import _FILES, LIST, is_half_done, recover, replaced
+from geogs.guard.atomic import prepare_output_folder, unwritable, write_text
+from geogs.guard.directory import Directory
+from geogs.guard.replacement import _FILES, LIST, is_half_done, recover, replaced
 
 OLD = {"mesh.ply": "old mesh", "keyframes/000001.jpg": "a", "keyframes/000002.jpg": "b"}
 NEW = {"mesh.ply": "new mesh", "keyframes/000001.jpg": "c", "report/index.html": "page"}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from geogs.kernel_folder import VARIABLE, can_be_written, find_kernel_folder, temporary_folder
+from geogs.guard.kernel_folder import VARIABLE, can_be_written, find_kernel_folder, temporary_folder
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_where_numba_finds_a_folder_nothing_is_said(temporary):
 
 @pytest.mark.parametrize("said", [None, "/mine"])
 def test_where_nothing_can_be_written_it_is_a_temporary_folder(temporary, monkeypatch, said):
-    monkeypatch.setattr("geogs.kernel_folder.can_be_written", lambda folder: False)
+    monkeypatch.setattr("geogs.guard.kernel_folder.can_be_written", lambda folder: False)
     if said is not None:
         monkeypatch.setenv(VARIABLE, said)
     else:

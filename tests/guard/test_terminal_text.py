@@ -11,9 +11,9 @@ from geogs.application.progress.terminal_progress import TerminalProgress
 from geogs.application.run_settings import Verbosity
 from geogs.cli.main import print_error
 from geogs.cli.terminal import process
-from geogs.terminal_text import escape_records, printable, say
+from geogs.guard.terminal_text import escape_records, printable, say
 
-SOURCES = Path(__file__).parents[1] / "src"
+SOURCES = Path(__file__).parents[2] / "src"
 HOSTILE = {
     "escape": "a\x1b]0;owned\x07b",
     "bell": "a\x07b",
@@ -85,7 +85,8 @@ def test_nothing_prints_foreign_text_another_way():
         "geogs/cli/eval.py: Console(markup=False).print(table(evaluation))",
         "geogs/cli/main.py: print(f'\\x1b[31m{text}\\x1b[0m' if is_coloured else text, "
         "file=sys.stderr)",
-        "geogs/terminal_text.py: print('\\n'.join(map(printable, lines)), file=file, flush=True)",
+        "geogs/guard/terminal_text.py: print('\\n'.join(map(printable, lines)), "
+        "file=file, flush=True)",
         "geogs_bench/board/commands.py: print(json.dumps(asdict(measured(sys.argv[1:]))))",
         "geogs_bench/cli.py: Console(markup=False).print(table)",
     ]

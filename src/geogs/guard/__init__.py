@@ -1,0 +1,1 @@
+"""Guards against hostile and damaged files, names, folders, servers and calls."""
