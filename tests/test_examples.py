@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 
 from geogs.config import Config, preset
+from saved_results import make_result
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOK = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
@@ -35,6 +36,22 @@ def quick(name: str) -> Config:
 def test_scripts_say_how_they_are_called(path):
     assert f"python examples/{path.name}" in path.read_text().split('"""')[1]
     assert 'if __name__ == "__main__":' in path.read_text()
+
+
+def test_the_gallery_shows_results_and_nothing_else(tmp_path, monkeypatch, capsys):
+    folder = make_result(tmp_path / "a <room>")
+    summary = {"frames": 5, "mesh_faces": 12, "seconds": {"total": 3.2}}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "report").mkdir()
+    (folder / "report" / "keyframes.png").write_bytes(b"a picture")
+    (tmp_path / "no-result").mkdir()
+    monkeypatch.setattr("sys.argv", ["gallery.py", str(folder), str(tmp_path / "no-result")])
+    script("gallery").main()
+    page = capsys.readouterr().out
+    assert page.count("<article>") == 1
+    assert "a &lt;room&gt;/report/keyframes.png" in page
+    assert "5 images, 12 triangles, 3 s" in page
+    assert "Poses were given." in page
 
 
 def test_the_notebook_has_no_outputs():
