@@ -77,7 +77,7 @@ class Work(ABC):
 
 
 class _FormerStays(Exception):
-    """An interrupted result was written into another folder, as a complete one is there."""
+    """An incomplete result was written into another folder, as a complete one is there."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -154,7 +154,7 @@ class Driver:
                     result = Result(scene, work.source, not finished, progress, output, can_resume)
                     write_more = partial(self._write_more, work, new)
                     write_files(new, result, write_more, settings.keyframe_images)
-                    if not finished and is_complete(output):
+                    if is_complete(output) and not is_complete(new):
                         raise _FormerStays(self._written_beside(new))
             except _FormerStays as kept:
                 result = replace(result, folder=kept.folder, can_resume=False)
@@ -173,12 +173,12 @@ class Driver:
         return result
 
     def _written_beside(self, new: Path) -> Path:
-        """Put the files of an interrupted result into a folder of their own. Returns the folder."""
+        """Put the files of an incomplete result into a folder of their own. Returns the folder."""
         with claimed(free_folder(self.output)) as other, replaced(other, "result") as files:
             for path in new.iterdir():
                 path.rename(files / path.name)
         self.progress.write(
-            f"The interrupted result goes to {other}; the complete one in {self.output} stays."
+            f"This incomplete result goes to {other}; the complete one in {self.output} stays."
         )
         return other
 

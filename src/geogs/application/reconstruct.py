@@ -134,13 +134,15 @@ def reconstruct_to_folder(
     finds_poses = settings.sfm
     if finds_poses:
         name = expanded(settings.source).resolve().name
+        made_from = ""
     else:
         source = open_posed_source(settings.source, config.input, settings.hold_out)
         name = without_ending(source.name, [settings.source])
+        made_from = source.fingerprint()
     may_replace = settings.overwrite or settings.resume is not None
     wanted = settings.resume or settings.output
     with (
-        claimed(chosen_folder(wanted, name, may_replace, progress)) as output,
+        claimed(chosen_folder(wanted, name, may_replace, progress, made_from)) as output,
         compiling(device, knows_poses=True) as kernels,
     ):
         if finds_poses:

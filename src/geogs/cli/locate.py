@@ -15,4 +15,6 @@ def main(argv: Sequence[str]) -> Answer:
     from geogs.application.locate import locate
 
     found = locate(options)
-    return Answer("\n".join(map(printable, found.lines())), {**found.as_dict(), "picture": found.picture})
+    return Answer(
+        "\n".join(map(printable, found.lines())), {**found.as_dict(), "picture": found.picture}
+    )

@@ -50,7 +50,8 @@ def main(argv: Sequence[str]) -> Answer | int:
         source = open_posed_source(options.source, options.config.input, options.hold_out)
         source = with_focal_length(source)
         name = without_ending(source.name, [options.source])
-        output = chosen_folder(options.output, name, options.overwrite)
+        made_from = source.fingerprint()
+        output = chosen_folder(options.output, name, options.overwrite, None, made_from)
         device = "cuda" if is_gpu(options.device) else "cpu"
         plan = plan_for(POSED_STAGES, output, len(source), source.camera, device)
         return dry_answer(source, plan)

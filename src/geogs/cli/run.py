@@ -101,7 +101,8 @@ def _dry_run(options: RunOptions) -> Answer:
     settings = record(RunSettings, options)
     stages = run_stages(settings, opened, maps_at_the_end(settings, None))
     frames = None if opened.is_live else opened.length
-    output = chosen_folder(options.output, opened.stem, options.overwrite)
+    made_from = opened.fingerprint()
+    output = chosen_folder(options.output, opened.stem, options.overwrite, None, made_from)
     device = "cuda" if is_gpu(options.device) else "cpu"
     return dry_answer(opened, plan_for(stages, output, frames, opened.camera, device))
 

@@ -22,7 +22,7 @@ from geogs.stopwatch import Stopwatch
 
 ENDS = (
     Outcome.FINISHED, Outcome.FINISHED, Outcome.STOPPED, Outcome.MEMORY_FULL,
-    TrackingLost("nothing was tracked"), KeyboardInterrupt(), "full disk",
+    TrackingLost("nothing was tracked"), KeyboardInterrupt(), "full disk", "no mesh",
 )  # fmt: skip
 
 
@@ -33,7 +33,8 @@ class Ending(Work):
 
     def __init__(self, number: int, source: str, end: object) -> None:
         summary = {"source": source, "number": number}
-        self.scene = SimpleNamespace(frames=9, stopwatch=Stopwatch(), summary=summary)
+        mesh = None if end == "no mesh" else "a mesh"
+        self.scene = SimpleNamespace(frames=9, stopwatch=Stopwatch(), summary=summary, mesh=mesh)
         self._end = end
 
     def complete(self, driver: Driver, checkpoint: object, new: Path) -> Outcome:
@@ -47,7 +48,8 @@ def run(number: int, source: str, given: str, overwrite: bool, end: object) -> N
     settings = RunSettings(checkpoint_every=0.0, depth_mesh=False)
     disk = full_disk(Path.cwd(), 5) if end == "full disk" else nullcontext()
     with suppress(GeogsError, KeyboardInterrupt):
-        folder = chosen_folder(Path(given) if given else None, source, overwrite)
+        place = Path(given) if given else None
+        folder = chosen_folder(place, source, overwrite, fingerprint=source)
         with claimed(folder) as output, disk:
             made = Driver(settings, output, torch.device("cpu"), RunProgress(), Stop())
             made.complete(Ending(number, source, end))
@@ -62,22 +64,32 @@ def numbers() -> dict[int, bool]:
 @pytest.mark.parametrize("seed", range(40))
 def test_a_complete_result_goes_only_where_that_was_asked_for(tmp_path, monkeypatch, seed):
     def write(new: Path, result: object, *_: object) -> None:
-        summary = result.scene.summary | {"interrupted": result.is_interrupted}
+        known = {
+            "interrupted": result.is_interrupted,
+            "fingerprint": result.scene.summary["source"],
+        }
+        summary = result.scene.summary | known
         (new / "trajectory.tum").write_text("0 0 0 0 0 0 0 1\n")
-        (new / "mesh.ply").write_bytes(bytes(4000))
+        if result.scene.mesh is not None:
+            (new / "mesh.ply").write_bytes(bytes(4000))
         (new / "summary.json").write_text(json.dumps(summary))
 
     monkeypatch.setattr(driver, "write_files", write)
     monkeypatch.chdir(tmp_path)
     rng = random.Random(seed)
+    sources: dict[int, str] = {}
     for number in range(8):
         before = numbers()
         source, given = rng.choice(["a", "b"]), rng.choice(["", "", "kept", "out/a"])
         overwrite, end = rng.random() < 0.3, rng.choice(ENDS)
+        sources[number] = source
         run(number, source, given, overwrite, end)
         after = numbers()
         lost = {known for known in before if known not in after}
-        assert len(lost) <= overwrite, (number, source, given)
+        may_replace = overwrite or given
+        assert len(lost) <= bool(may_replace), (number, source, given)
+        if not overwrite:
+            assert all(sources[known] == source for known in lost), (number, source, given)
         if any(before[known] for known in lost):
             assert after.get(number) is True, (number, end)
         if end is Outcome.FINISHED and (overwrite or not given):

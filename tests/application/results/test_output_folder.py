@@ -59,6 +59,17 @@ def test_a_named_folder_with_a_result_is_refused(tmp_path, summary):
     assert chosen_folder(tmp_path / "of-others", "x", False) == tmp_path / "of-others"
 
 
+def test_an_earlier_result_of_the_same_source_may_be_replaced(tmp_path):
+    folder = put(tmp_path / "kept", '{"source": "b", "fingerprint": "ab12"}')
+    heard = Heard()
+    assert chosen_folder(folder, "b", False, heard, "ab12") == folder
+    assert heard.said == [f"{folder} holds the result of b; a complete new one replaces it."]
+    with pytest.raises(OutputError, match="--overwrite to replace it"):
+        chosen_folder(folder, "b", False, heard, "cd34")
+    with pytest.raises(OutputError, match="--overwrite to replace it"):
+        chosen_folder(folder, "b", False, heard)
+
+
 def test_a_write_that_was_interrupted_counts_as_a_result(tmp_path):
     folder = tmp_path / "killed"
     folder.mkdir()
@@ -71,7 +82,10 @@ def test_a_write_that_was_interrupted_counts_as_a_result(tmp_path):
 
 def test_only_a_result_that_came_to_its_end_is_complete(tmp_path):
     for name, summary in {"a": {"interrupted": False}, "b": {"interrupted": True}, "c": {}}.items():
-        assert is_complete(put(tmp_path / name, json.dumps(summary))) is (name == "a")
+        folder = put(tmp_path / name, json.dumps(summary))
+        assert not is_complete(folder)
+        (folder / "mesh.ply").write_bytes(b"a mesh")
+        assert is_complete(folder) is (name == "a")
     assert not is_complete(tmp_path / "missing")
 
 

@@ -83,7 +83,11 @@ def claimed(folder: Path) -> Iterator[Path]:
 
 
 def chosen_folder(
-    given: Path | None, name: str, overwrite: bool, progress: RunProgress | None = None
+    given: Path | None,
+    name: str,
+    overwrite: bool,
+    progress: RunProgress | None = None,
+    fingerprint: str = "",
 ) -> Path:
     """The folder for a new result: the given one, else out/NAME, or out/NAME-2 where that is taken.
 
@@ -91,14 +95,19 @@ def chosen_folder(
         given: folder that the user named; none if they named none.
         name: name of the source.
         overwrite: whether an earlier result, or an unfinished run, may be replaced.
-        progress: is told which folder is taken instead of ``out/NAME``.
+        progress: is told which folder is taken instead of ``out/NAME``, or what is replaced.
+        fingerprint: that of the source, whose earlier result in a given folder may be replaced.
 
     Raises:
-        OutputError: the given folder holds a result or an unfinished run, which stays.
+        OutputError: the given folder holds the result of another source, or an unfinished run.
     """
     wanted = given or Path("out") / name
     held = content(wanted)
     if overwrite or not held:
+        return wanted
+    if given is not None and fingerprint and _fingerprint_of(wanted) == fingerprint:
+        if progress is not None:
+            progress.write(f"{wanted} holds {held}; a complete new one replaces it.")
         return wanted
     if given is not None:
         ways = "give another folder (-o), or --overwrite to replace it."
@@ -129,9 +138,10 @@ def content(folder: Path) -> str:
 
 
 def is_complete(folder: Path) -> bool:
-    """Whether a folder holds a result that was made to its end."""
+    """Whether a folder holds a result that was made to its end, and has a mesh."""
     try:
-        return read_summary(folder).get("interrupted") is False
+        is_whole = read_summary(folder).get("interrupted") is False
+        return is_whole and (expanded(folder) / "mesh.ply").is_file()
     except InputError:
         return False
 
@@ -143,6 +153,14 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not isinstance(summary, dict):
         raise InputError(f"{path} is damaged; it holds no summary of a run.")
     return summary
+
+
+def _fingerprint_of(folder: Path) -> object:
+    """Fingerprint of the source of a result; none where it has none."""
+    try:
+        return read_summary(folder).get("fingerprint")
+    except InputError:
+        return None
 
 
 def _source_of(folder: Path) -> str:
