@@ -23,7 +23,7 @@ def result(tmp_path_factory) -> SavedResult:
 
 
 def test_each_vertex_has_the_colour_that_the_keyframe_saw_there(result):
-    still = result.keyframes[0]
+    still = result.renders[0]
     shown, texture = page_surface(result.mesh, [still])
     image = cv2.imdecode(np.frombuffer(texture.jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     T_cw = still.T_cw.numpy()
@@ -52,7 +52,7 @@ def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def test_the_triangles_are_those_of_the_mesh(result):
-    shown, texture = page_surface(result.mesh, result.keyframes)
+    shown, texture = page_surface(result.mesh, result.renders)
     assert len(texture.uv) == len(shown.vertices) >= len(result.mesh.vertices)
     assert 0 <= texture.uv.min() <= texture.uv.max() <= 1
     np.testing.assert_allclose(
@@ -68,8 +68,8 @@ def test_without_images_or_faces_that_they_show_there_is_none(result, monkeypatc
     assert none is None
     assert len(bare.faces) == len(result.mesh.faces)
     behind = Mesh(-result.mesh.vertices - 50, result.mesh.faces, -result.mesh.normals)
-    assert page_surface(behind, result.keyframes)[1] is None
+    assert page_surface(behind, result.renders)[1] is None
     monkeypatch.setattr(owner, "MAX_FACES", 400)
     monkeypatch.setattr(owner, "MAX_TEXTURED", 300)
     assert 300 < len(page_surface(result.mesh, [])[0].faces) <= 440
-    assert len(page_surface(result.mesh, result.keyframes)[0].faces) <= 330
+    assert len(page_surface(result.mesh, result.renders)[0].faces) <= 330

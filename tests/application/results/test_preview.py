@@ -45,7 +45,7 @@ def test_it_is_there_before_the_map_and_gone_with_the_result(small_room, tmp_pat
     looked = Looked(output)
     result = run(RunSettings((small_room,), config, output, "cpu"), looked)
     assert looked.seen
-    (said,) = [text for text in looked.said if "rough mesh" in text]
+    (said,) = [text for text in looked.said if "rough preview" in text]
     assert str(output / PREVIEW) in said
     assert not (output / PREVIEW).exists()
     slam = result.scene

@@ -23,7 +23,8 @@ from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.mapping.first_look import first_points
 from geogs.mapping.known_poses import expect_depths
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.mesh.texture.textured import texture_mesh
+from geogs.mesh.triangle_mesh import DepthMapView, median_edge
 from geogs.reconstruction import Reconstruction
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.classical_flow import ClassicalFlow
@@ -145,7 +146,9 @@ def _bare() -> None:
 
 
 def _mesh() -> None:
-    extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
+    views = [_seen(number) for number in range(VIEWS)]
+    mesh = extract_mesh(views, MeshConfig(triangle_budget=500))
+    texture_mesh(mesh, views, 2 * median_edge(mesh), 256)
 
 
 _STEPS = {

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.application.results.page_surface import page_surface
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.upright import tracked_poses, upright
 from geogs.evaluation.model_view.levelling import facets
@@ -202,6 +201,8 @@ def shown_model(
     seen = None
     disk_model = None
     if mesh is not None and len(mesh.faces):
+        from geogs.application.results.page_surface import page_surface
+
         shown, texture = page_surface(mesh, renders)
         colourings = more_colourings(shown)
         if texture is None and shown.colours is not None:

@@ -85,6 +85,8 @@ def followed(
     if judged is not None and is_doubtful and options.quiet:
         say(f"warning: {judged.sentence}", is_error=True)
     if result.mesh is None and not result.is_interrupted:
+        if not options.quiet:
+            say(*words)
         why = result.why_no_map or "The surface could not be determined."
         raise TrackingLost(f"No mesh was made; the other files are in {result.folder}/. {why}")
     code = EXIT_NOT_RELIABLE if is_doubtful and strict else 0

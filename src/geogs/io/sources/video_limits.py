@@ -41,7 +41,7 @@ def check_decodable(container: InputContainer, name: str, most: int = MOST_PIXEL
     most = min(most, MOST_PIXELS)
     fault = ""
     if context is None:
-        fault = "is a video of a codec that is not known here; convert it to H.264"
+        fault = "cannot be decoded: is it complete? If its codec is rare, convert it to H.264"
     elif context.width * context.height > most:
         size = f"{context.width}x{context.height}"
         fault = f"states {size} pixels, more than it can have; make its images smaller"

@@ -36,8 +36,10 @@ PATIENT, LEAST_DECREASE = replace(OPTIONS, iterations=60), 1e-6
 flat valley, along which each step gains little; an early stop would be near the start."""
 
 
-_SQUEEZE, _MOST_SQUEEZE = 0.03, 0.8
+_SQUEEZE, _MOST_SQUEEZE = 0.03, 0.75
 """Least and largest change of log fy / fx that is looked for."""
+_ASIDE, _RISE = 0.1, 1.1
+"""Change of log fy / fx from the best by which the cost has to rise, and by which factor."""
 _SAME_ASPECT = 0.004
 """Change of log fy / fx that needs no further adjustment once the pixels are no squares."""
 _BETTER = 0.7
@@ -185,6 +187,8 @@ class GrowingBundle:
         it did. The pixels of a video may be no squares, and its file need not say so."""
         assert self.result is not None
         problem = self._whole_problem()
+        if self._rows is not None and problem.by_rows is None:
+            return False  # rows of a turning camera would be taken for another aspect
 
         @cache
         def cost(log_aspect: float) -> float:
@@ -195,10 +199,15 @@ class GrowingBundle:
         if min(cost(-least), cost(least)) >= self.result.cost:
             return False
         bounds = (-_MOST_SQUEEZE, _MOST_SQUEEZE)
-        best = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3})
-        if abs(best.x) < least or not (self._is_squeezed or best.fun < _BETTER * self.result.cost):
+        found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+        best = float(found.x)
+        # A camera that turns about one axis leaves the aspect open: there is no clear minimum.
+        is_clear = min(cost(best - _ASIDE), cost(best + _ASIDE)) > _RISE * found.fun
+        is_better = self._is_squeezed or found.fun < _BETTER * self.result.cost
+        total = math.log(self.lens.fy / self.lens.fx) + best
+        if not (is_clear and is_better and least <= abs(best) and abs(total) < _MOST_SQUEEZE):
             return False
-        self.lens = self._squeezed(float(best.x))
+        self.lens = self._squeezed(best)
         self._is_squeezed = True
         return True
 
