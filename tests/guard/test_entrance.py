@@ -181,7 +181,15 @@ def usual_settings() -> tuple[object, ...]:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("setting", ["inference mode", "double", "NumPy raises", "no grad"])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        pytest.param("inference mode", marks=pytest.mark.long),
+        "double",
+        pytest.param("NumPy raises", marks=pytest.mark.long),
+        pytest.param("no grad", marks=pytest.mark.long),
+    ],
+)
 def test_settings_of_a_program_change_no_pose_and_stay(setting):
     expected = expected_poses()
     before = usual_settings()

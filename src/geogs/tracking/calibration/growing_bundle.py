@@ -42,9 +42,9 @@ _ASIDE, _RISE = 0.1, 1.1
 """Change of log fy / fx from the best by which the cost has to rise, and by which factor."""
 _SAME_ASPECT = 0.004
 """Change of log fy / fx that needs no further adjustment once the pixels are no squares."""
-_BETTER = 0.7
-"""Largest cost with another aspect relative to that with square pixels; chosen on synthetic clips
-(docs/notebook/calibration.md)."""
+_FALL, _BETTER = 0.97, 0.7
+"""Largest cost, relative to that with square pixels, with a changed aspect for others to be tried,
+and with the best; chosen on synthetic clips (docs/notebook/calibration.md)."""
 
 
 @dataclass
@@ -195,8 +195,8 @@ class GrowingBundle:
             result = self._solved(problem, self._squeezed(log_aspect))
             return result.cost if result.finite else math.inf
 
-        least = _SAME_ASPECT if self._is_squeezed else _SQUEEZE
-        if min(cost(-least), cost(least)) >= self.result.cost:
+        least, fall = (_SAME_ASPECT, 1.0) if self._is_squeezed else (_SQUEEZE, _FALL)
+        if min(cost(-least), cost(least)) >= fall * self.result.cost:
             return False
         bounds = (-_MOST_SQUEEZE, _MOST_SQUEEZE)
         found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-3})
