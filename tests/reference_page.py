@@ -15,7 +15,7 @@ _INTRODUCTION = """\
 # Reference
 
 Made from the docstrings by `python tests/reference_page.py`; a test holds this page to them.
-[From Python](api.md) has examples, and `help(geogs.track)` all that is said of a function.
+[From Python](api.md) has examples, and `help(geogs.track)` describes one function in full.
 """
 
 PARTS = {

@@ -1,4 +1,4 @@
-"""What a command is about to do: its stages, and how long they take by earlier results."""
+"""The stages of a command before it runs, and their time by earlier results."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -49,7 +49,7 @@ def run_stages(settings: RunSettings, source: Source, maps_at_end: bool) -> tupl
 
 @dataclass(frozen=True)
 class Plan:
-    """What a command would do."""
+    """Folder, stages, time and memory of a command."""
 
     output: Path
     """Folder of the result."""

@@ -134,11 +134,11 @@ def reconstruct_to_folder(
     finds_poses = settings.sfm
     if finds_poses:
         name = expanded(settings.source).resolve().name
-        made_from = ""
+        made_from = None
     else:
         source = open_posed_source(settings.source, config.input, settings.hold_out)
         name = without_ending(source.name, [settings.source])
-        made_from = source.fingerprint()
+        made_from = source.fingerprint
     may_replace = settings.overwrite or settings.resume is not None
     wanted = settings.resume or settings.output
     with (

@@ -71,9 +71,9 @@ def run(
     wanted = settings.output or Path("out") / opened.stem
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
-    replaces = settings.overwrite
-    made_from = opened.fingerprint()
-    wanted = chosen_folder(settings.output, opened.stem, replaces, progress, made_from)
+    wanted = chosen_folder(
+        settings.output, opened.stem, settings.overwrite, progress, opened.fingerprint
+    )
     compiled = compiling(device) if kernels is None else nullcontext(kernels)
     with claimed(wanted) as output, compiled as kernels:
         compile_gpu_kernels(device)

@@ -50,8 +50,9 @@ def main(argv: Sequence[str]) -> Answer | int:
         source = open_posed_source(options.source, options.config.input, options.hold_out)
         source = with_focal_length(source)
         name = without_ending(source.name, [options.source])
-        made_from = source.fingerprint()
-        output = chosen_folder(options.output, name, options.overwrite, None, made_from)
+        output = chosen_folder(
+            options.output, name, options.overwrite, fingerprint=source.fingerprint
+        )
         device = "cuda" if is_gpu(options.device) else "cpu"
         plan = plan_for(POSED_STAGES, output, len(source), source.camera, device)
         return dry_answer(source, plan)

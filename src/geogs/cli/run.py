@@ -88,7 +88,7 @@ def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> Answer | 
 
 
 def _dry_run(options: RunOptions) -> Answer:
-    """What the input holds and would be done."""
+    """Open the input; return its account and the plan."""
     from geogs.application.calibrate import without_overlay
     from geogs.application.plan import plan_for, run_stages
     from geogs.application.progress.terminal_progress import TerminalProgress
@@ -101,8 +101,9 @@ def _dry_run(options: RunOptions) -> Answer:
     settings = record(RunSettings, options)
     stages = run_stages(settings, opened, maps_at_the_end(settings, None))
     frames = None if opened.is_live else opened.length
-    made_from = opened.fingerprint()
-    output = chosen_folder(options.output, opened.stem, options.overwrite, None, made_from)
+    output = chosen_folder(
+        options.output, opened.stem, options.overwrite, fingerprint=opened.fingerprint
+    )
     device = "cuda" if is_gpu(options.device) else "cpu"
     return dry_answer(opened, plan_for(stages, output, frames, opened.camera, device))
 

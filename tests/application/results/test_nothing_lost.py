@@ -49,7 +49,7 @@ def run(number: int, source: str, given: str, overwrite: bool, end: object) -> N
     disk = full_disk(Path.cwd(), 5) if end == "full disk" else nullcontext()
     with suppress(GeogsError, KeyboardInterrupt):
         place = Path(given) if given else None
-        folder = chosen_folder(place, source, overwrite, fingerprint=source)
+        folder = chosen_folder(place, source, overwrite, fingerprint=lambda: source)
         with claimed(folder) as output, disk:
             made = Driver(settings, output, torch.device("cpu"), RunProgress(), Stop())
             made.complete(Ending(number, source, end))

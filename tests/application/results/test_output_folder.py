@@ -62,10 +62,10 @@ def test_a_named_folder_with_a_result_is_refused(tmp_path, summary):
 def test_an_earlier_result_of_the_same_source_may_be_replaced(tmp_path):
     folder = put(tmp_path / "kept", '{"source": "b", "fingerprint": "ab12"}')
     heard = Heard()
-    assert chosen_folder(folder, "b", False, heard, "ab12") == folder
+    assert chosen_folder(folder, "b", False, heard, lambda: "ab12") == folder
     assert heard.said == [f"{folder} holds the result of b; a complete new one replaces it."]
     with pytest.raises(OutputError, match="--overwrite to replace it"):
-        chosen_folder(folder, "b", False, heard, "cd34")
+        chosen_folder(folder, "b", False, heard, lambda: "cd34")
     with pytest.raises(OutputError, match="--overwrite to replace it"):
         chosen_folder(folder, "b", False, heard)
 

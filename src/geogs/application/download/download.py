@@ -87,7 +87,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def _guarded(read: Iterator[T], archive: Path) -> Iterator[T]:
-    """What is read from an archive. Raises InputError for any error in reading it."""
+    """Read an archive. Raises InputError for any error in reading it."""
     try:
         yield from read
     except (GeogsError, MemoryError):

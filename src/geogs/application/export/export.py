@@ -68,7 +68,7 @@ EXPORTS = "export/exports.json"
 _OPTIONS = tuple(
     f.name for f in fields(ExportSettings) if f.name not in ("result", "output", "device")
 )
-"""What is kept of the settings of an export."""
+"""Settings of an export that are kept."""
 MOST_ON_PHONES = 200_000
 """Most triangles of a USDZ, which phones show without delay."""
 

@@ -1,4 +1,4 @@
-"""What of a result is exported: all of it, or the part inside a region."""
+"""The exported part of a result: all of it, or what lies inside a region."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +27,7 @@ class Part:
     axes: Float[np.ndarray, "3 3"]
     """Rows right, forward and up of the result's world."""
     images: tuple[str, ...] = ()
-    """What the run read, where its images are exported at full size."""
+    """The source of the run, if its images are exported at full size."""
 
     @property
     def originals(self) -> Source | None:

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path
@@ -87,7 +87,7 @@ def chosen_folder(
     name: str,
     overwrite: bool,
     progress: RunProgress | None = None,
-    fingerprint: str = "",
+    fingerprint: Callable[[], str] | None = None,
 ) -> Path:
     """The folder for a new result: the given one, else out/NAME, or out/NAME-2 where that is taken.
 
@@ -96,7 +96,8 @@ def chosen_folder(
         name: name of the source.
         overwrite: whether an earlier result, or an unfinished run, may be replaced.
         progress: is told which folder is taken instead of ``out/NAME``, or what is replaced.
-        fingerprint: that of the source, whose earlier result in a given folder may be replaced.
+        fingerprint: makes that of the source, whose earlier result in a given folder may be
+            replaced; asked only where there is one, as it looks at all files of the source.
 
     Raises:
         OutputError: the given folder holds the result of another source, or an unfinished run.
@@ -105,7 +106,7 @@ def chosen_folder(
     held = content(wanted)
     if overwrite or not held:
         return wanted
-    if given is not None and fingerprint and _fingerprint_of(wanted) == fingerprint:
+    if given is not None and fingerprint and _summary_value(wanted, "fingerprint") == fingerprint():
         if progress is not None:
             progress.write(f"{wanted} holds {held}; a complete new one replaces it.")
         return wanted
@@ -125,7 +126,7 @@ def free_folder(wanted: Path) -> Path:
 
 
 def content(folder: Path) -> str:
-    """What a new result would replace in a folder, in words; empty where that is nothing."""
+    """Describe the result or unfinished run in a folder; empty if there is none."""
     folder = expanded(folder)
     if os.path.lexists(folder / "summary.json") or is_half_done(folder):
         source = _source_of(folder)
@@ -139,11 +140,8 @@ def content(folder: Path) -> str:
 
 def is_complete(folder: Path) -> bool:
     """Whether a folder holds a result that was made to its end, and has a mesh."""
-    try:
-        is_whole = read_summary(folder).get("interrupted") is False
-        return is_whole and (expanded(folder) / "mesh.ply").is_file()
-    except InputError:
-        return False
+    is_whole = _summary_value(folder, "interrupted") is False
+    return is_whole and (expanded(folder) / "mesh.ply").is_file()
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -155,17 +153,15 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return summary
 
 
-def _fingerprint_of(folder: Path) -> object:
-    """Fingerprint of the source of a result; none where it has none."""
+def _summary_value(folder: Path, key: str) -> object:
+    """A value of a result's summary; none if there is no summary, or it has no such value."""
     try:
-        return read_summary(folder).get("fingerprint")
+        return read_summary(folder).get(key)
     except InputError:
         return None
 
 
 def _source_of(folder: Path) -> str:
     """Name of the source of a result, as its summary has it; empty where it has none."""
-    try:
-        return in_short(str(read_summary(folder).get("source", "")) or " ").strip()
-    except InputError:
-        return ""
+    source = _summary_value(folder, "source")
+    return in_short(str(source)).strip() if source else ""

@@ -34,7 +34,7 @@ def say_loading(options: Verbosity) -> None:
 
 
 def dry_answer(source: "Source | PosedSource", plan: "Plan") -> Answer:
-    """What an input holds, how it is read and what would be done, for ``--dry-run``."""
+    """Answer to ``--dry-run``: the account of the input, and the plan."""
     lines = [*source.account.lines(source.found), *plan.lines()]
     found = {"found": source.found, **asdict(source.account)}
     return Answer("\n".join(map(printable, lines)), {"input": found, "plan": asdict(plan)})
