@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import CellProjection, project, relative_motion
-from geogs.geometry.camera import Camera
+from geogs.geometry.camera import LEAST_SLOPE, Camera
 
 UNIT = 0.01
 """Unit of the readout in the equations, seconds: it makes all unknowns of similar size."""
@@ -51,8 +51,8 @@ class LensBlock:
         """Derivatives of the rays: d x / d log f, d x / d k1 and d x / d k2 are these factors times
         x; likewise for y."""
         square = self.rays[:, :2].square().sum(-1)
-        by = torch.stack([self.lens.growth(square), square, square.square()])
-        return -by / self.lens.steepness(square)
+        by = torch.stack(self.lens.radial_shapes(square))
+        return -by / self.lens.steepness(square).clamp(min=LEAST_SLOPE)
 
     def moved(self, step: Float[Tensor, "m"]) -> "LensBlock":
         """Return the block after a step of all unknowns, zero for those that are no variables."""

@@ -63,7 +63,7 @@ class LensFlow:
             depth = state.inverse_depth[frame].contiguous()
             E, C, b = depth.new_zeros(size, len(depth)), *depth.new_zeros(2, len(depth))
             linearise_source(
-                edges.motions[e], edges.rays, slopes, edges.lens, depth.numpy(), edges.pixels[e],
+                edges.motions[e], edges.rays, slopes, *edges.lens, depth.numpy(), edges.pixels[e],
                 edges.weight[e], further[e], limits,
                 H.numpy(), g.numpy(), E.numpy(), C.numpy(), b.numpy(),
             )  # fmt: skip
@@ -84,7 +84,7 @@ class LensFlow:
             cost_of_source(
                 edges.motions[e],
                 edges.rays,
-                edges.lens,
+                *edges.lens,
                 _float(state.inverse_depth[frame]),
                 edges.pixels[e],
                 edges.weight[e],
@@ -104,11 +104,13 @@ class _Edges:
     def __init__(
         self, block: LensBlock, problem: BundleProblem, T_ji: Float[Tensor, "e 4 4"]
     ) -> None:
+        from geogs.geometry.bend_kernels import lens_arguments
+
         lens = block.lens
         self.motions = _float(T_ji[:, :3])
         self.rays = _float(block.rays[:, :2].mT)
         self.slopes = _float(block.slopes)
-        self.lens = np.array(lens.numbers, np.float32)
+        self.lens = lens_arguments(lens)
         self.pixels = _float(problem.unrolled(block.readout))
         self.weight = _float(problem.weight)
 

@@ -2,7 +2,7 @@
 
 Arrays are C-contiguous and float32, except sums over cells, which are float64: motions to the
 targets (e, 3, 4), rays of the cells (2, p) with z = 1, the lens (6) as fx, fy, cx, cy, k1 and k2,
-inverse depths (p), measured positions and their weights (e, p, 2). The kernels release the
+and more of it or None (:mod:`geogs.geometry.bend_kernels`), inverse depths (p), measured positions and their weights (e, p, 2). The kernels release the
 interpreter lock. Chains of small PyTorch operations take ten times as long, and threads that call
 them wait for each other.
 """
@@ -10,20 +10,14 @@ them wait for each other.
 import numpy as np
 from numba import njit
 
-from geogs.geometry.camera import LEAST_SLOPE
+from geogs.geometry.bend_kernels import FAST as _FAST
+from geogs.geometry.bend_kernels import aside_at, growth_at
 from geogs.kernel_parts import inlined
 
-_FAST = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "nsz", "arcp"},  # non-finite values have to be kept
-}
 _PART = inlined(_FAST)
 _BLOCK = 64
 """Cells whose derivatives are computed at a time: they fit into the L1 cache."""
-_ZERO, _ONE, _TWO, _THREE, _FOUR, _FIVE = map(np.float32, range(6))
-_LEAST_SLOPE = np.float32(LEAST_SLOPE)
+_ZERO, _ONE, _TWO = map(np.float32, range(3))
 
 
 @njit(**_PART)
@@ -37,12 +31,6 @@ def _seen(motion, x, y, d, nearest):
 
 
 @njit(**_PART)
-def _unfolded(square, k1, k2):
-    """Whether the lens does not fold over at this squared distance from its axis."""
-    return _ONE + square * (_THREE * k1 + _FIVE * square * k2) > _LEAST_SLOPE
-
-
-@njit(**_PART)
 def _dot(left, right):
     """Return the scalar product of two blocks."""
     total = _ZERO
@@ -52,7 +40,9 @@ def _dot(left, right):
 
 
 @njit(**_PART)
-def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limits, J, r, w):
+def _derivatives(
+    motion, rays, slopes, lens, more, inverse_depth, pixels, weight, limits, J, r, w
+):
     """Compute derivatives of some cells for :func:`linearise_source`: the x of all, then the y. The
     last row of ``J`` is by the inverse depth."""
     huber = limits[0]
@@ -73,11 +63,12 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
         d = inverse_depth[n]
         u, v, q, is_front = _seen(motion, x, y, d, nearest)
         square = u * u + v * v
-        growth = _ONE + square * (k1 + square * k2)
-        bent = _TWO * k1 + _FOUR * k2 * square
+        growth, bent, by_k1, by_k2, is_shown = growth_at(square, k1, k2, more)
+        aside_x, aside_y, aside_xx, aside_xy, aside_yy = aside_at(u, v, more)
         # d pixel / d (u, v)
-        xx, xy = fx * (growth + bent * u * u), fx * bent * u * v
-        yx, yy = fy * bent * u * v, fy * (growth + bent * v * v)
+        both = bent * u * v + aside_xy
+        xx, xy = fx * (growth + bent * u * u + aside_xx), fx * both
+        yx, yy = fy * both, fy * (growth + bent * v * v + aside_yy)
         dq = d * q
         first[0, n] = xx * dq
         second[0, n] = yx * dq
@@ -105,15 +96,15 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
             along = xx * a + xy * b
             across = yx * a + yy * b
             own_x, own_y = fx * u, fy * v
-            first[6, n] = along * slopes[0, n] + own_x * growth
-            second[6, n] = across * slopes[0, n] + own_y * growth
-            first[7, n] = along * slopes[1, n] + own_x * square
-            second[7, n] = across * slopes[1, n] + own_y * square
-            first[8, n] = along * slopes[2, n] + own_x * square * square
-            second[8, n] = across * slopes[2, n] + own_y * square * square
-        a = pixels[n, 0] - (fx * u * growth + cx)
-        b = pixels[n, 1] - (fy * v * growth + cy)
-        is_front = is_front and _unfolded(square, k1, k2)
+            first[6, n] = along * slopes[0, n] + own_x * growth + fx * aside_x
+            second[6, n] = across * slopes[0, n] + own_y * growth + fy * aside_y
+            first[7, n] = along * slopes[1, n] + own_x * by_k1
+            second[7, n] = across * slopes[1, n] + own_y * by_k1
+            first[8, n] = along * slopes[2, n] + own_x * by_k2
+            second[8, n] = across * slopes[2, n] + own_y * by_k2
+        a = pixels[n, 0] - (fx * (u * growth + aside_x) + cx)
+        b = pixels[n, 1] - (fy * (v * growth + aside_y) + cy)
+        is_front = is_front and is_shown
         wx = weight[n, 0] if is_front else _ZERO
         wy = weight[n, 1] if is_front else _ZERO
         norm = np.sqrt(wx * a * a + wy * b * b)
@@ -126,7 +117,7 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
 
 @njit(**_FAST)
 def linearise_source(
-    motions, rays, slopes, lens, inverse_depth, pixels, weight, further, limits,
+    motions, rays, slopes, lens, more, inverse_depth, pixels, weight, further, limits,
     hessian, gradient, coupling, curvature, pull,
 ):  # fmt: skip
     """Add the equations of all edges of a source to the output arrays.
@@ -159,6 +150,7 @@ def linearise_source(
                 rays[:, begin:end],
                 slopes[:, begin:end],
                 lens,
+                more,
                 inverse_depth[begin:end],
                 pixels[e, begin:end],
                 weight[e, begin:end],
@@ -194,7 +186,7 @@ def linearise_source(
 
 
 @njit(**_FAST)
-def cost_of_source(motions, rays, lens, inverse_depth, pixels, weight, limits, behind):
+def cost_of_source(motions, rays, lens, more, inverse_depth, pixels, weight, limits, behind):
     """Return Huber's cost of a source's matched cells; ``behind`` is used behind their target."""
     knee = limits[0]
     nearest = limits[1]
@@ -212,11 +204,12 @@ def cost_of_source(motions, rays, lens, inverse_depth, pixels, weight, limits, b
                 continue
             u, v, _, is_front = _seen(motion, rays[0, n], rays[1, n], inverse_depth[n], nearest)
             square = u * u + v * v
-            growth = _ONE + square * (k1 + square * k2)
-            a = pixels[e, n, 0] - (fx * u * growth + cx)
-            b = pixels[e, n, 1] - (fy * v * growth + cy)
+            growth, _, _, _, is_shown = growth_at(square, k1, k2, more)
+            aside_x, aside_y, _, _, _ = aside_at(u, v, more)
+            a = pixels[e, n, 0] - (fx * (u * growth + aside_x) + cx)
+            b = pixels[e, n, 1] - (fy * (v * growth + aside_y) + cy)
             error = weight[e, n, 0] * a * a + weight[e, n, 1] * b * b
-            if not (is_front and _unfolded(square, k1, k2)):
+            if not (is_front and is_shown):
                 error = behind
             total += (
                 error if not error > knee * knee else _TWO * knee * np.sqrt(error) - knee * knee

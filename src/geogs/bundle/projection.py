@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.geometry.camera import LEAST_SLOPE, Camera
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 
 MIN_Z = 0.05
@@ -93,13 +93,12 @@ def project(
 ) -> CellProjection:
     """Project the cells of source frames: pixels of y from :func:`seen_from_targets`.
 
-    Cells so far off the axis that radial terms fold them over are not valid.
+    Cells so far off the axis that the lens folds them over are not valid.
     """
     y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
     if not camera.is_pinhole:
         plane = y[..., :2] / z[..., None]
-        is_shown = camera.steepness(plane.square().sum(-1)) > LEAST_SLOPE
-        return CellProjection(camera.pixels(plane), valid & is_shown, z)
+        return CellProjection(camera.pixels(plane), valid & camera.shows(plane), z)
     pixels = torch.stack(
         [camera.fx * y[..., 0] / z + camera.cx, camera.fy * y[..., 1] / z + camera.cy], -1
     )
@@ -144,15 +143,7 @@ def carried_over(
     """
     focal = at.pixels.new_tensor([camera.fx, camera.fy])
     plane = camera.plane(at.pixels)
-    step = step / focal
-    if not camera.is_pinhole:
-        xx, xy, yy = camera.bend_jacobian(rays[:, :2])
-        x, y = step.unbind(-1)
-        step = torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / (xx * yy - xy * xy)[:, None]
+    step = camera.unbent_step(rays[:, :2], step / focal)
     moved = (T_ji[:, :3, :2].to(step) @ step.mT).mT  # as in :func:`seen_from_targets`
     off = moved[..., :2] - plane * moved[..., 2:]
-    if not camera.is_pinhole:
-        xx, xy, yy = camera.bend_jacobian(plane)
-        x, y = off.unbind(-1)
-        off = torch.stack([xx * x + xy * y, xy * x + yy * y], -1)
-    return focal * off / at.z[..., None]
+    return focal * camera.bent_step(plane, off) / at.z[..., None]

@@ -1,26 +1,39 @@
-"""Camera model: a pinhole, or with radial distortion; pixel centres at integer coordinates."""
+"""Camera model: a pinhole, OpenCV's polynomial lens or its fisheye; pixel centres at integers."""
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.errors import InputError
 
 LEAST_SLOPE = 0.1
 """Least slope of the distorted radius; below it the image folds over."""
+FISHEYE_LIMIT = math.radians(88.0)
+"""Angle from the axis up to which the plane z = 1 is used; rays beyond are clamped to it."""
+_CENTRAL = 1e-4
+"""Squared distance from the axis below which the slope of a fisheye's growth is that at the axis."""
+_RADIAL_STEPS, _PLANE_STEPS = 8, 6
+"""Newton steps to undistort: along the radius, and then with tangential terms in the plane."""
 
 
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics in pixels; the centre of pixel (0, 0) is (0, 0).
 
-    Pixel = c + f x (1 + k1 |x|^2 + k2 |x|^4), x = (X / Z, Y / Z): OpenCV's model with k1 and k2
-    alone. Without them it is a pinhole, and images are undistorted. Only tracking accepts
-    distortion: depth search, renderer, mesh and textures need pinholes.
+    A pixel is at c + f b(x) for a ray that meets the plane z = 1 at x, r = |x|:
+
+    - a pinhole: b(x) = x;
+    - OpenCV's polynomial: b(x) = x g + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y),
+      g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6);
+    - a fisheye (Kannala and Brandt, PAMI 2006): b(x) = x g, with the angle a = atan r from the axis
+      and g = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) / r.
+
+    Tracking accepts all of them; depth search, renderer, mesh and textures need pinholes.
     """
 
     fx: float
@@ -31,6 +44,13 @@ class Camera:
     height: int
     k1: float = 0.0
     k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    is_fisheye: bool = False
 
     def __post_init__(self) -> None:
         """Raises InputError for numbers that are none of a camera."""
@@ -41,9 +61,9 @@ class Camera:
             is_finite = is_image = False
         if not (is_finite and is_image and self.fx > 0 and self.fy > 0):
             raise InputError(
-                f"There is no camera with fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy}, "
-                f"k1 {self.k1} and k2 {self.k2} for images of {self.width} x {self.height}; focal "
-                "lengths and sizes are positive, all numbers finite."
+                f"There is no camera with fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy} "
+                f"and distortion {self.distortion} for images of {self.width} x {self.height}; "
+                "focal lengths and sizes are positive, all numbers finite."
             )
 
     @property
@@ -53,8 +73,13 @@ class Camera:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """fx, fy, cx, cy, k1 and k2, for kernels."""
-        return self.fx, self.fy, self.cx, self.cy, self.k1, self.k2
+        """fx, fy, cx, cy, the distortion, and 1 for a fisheye, for kernels."""
+        return self.fx, self.fy, self.cx, self.cy, *self.distortion, float(self.is_fisheye)
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """k1, k2, p1, p2, k3, k4, k5, k6: OpenCV's order for the polynomial."""
+        return self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6
 
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
@@ -126,45 +151,118 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether it has no radial terms."""
-        return not (self.k1 or self.k2)
+        """Whether it has no distortion."""
+        return not (self.is_fisheye or any(self.distortion))
 
     @property
     def pinhole(self) -> "Camera":
-        """The same camera without radial terms."""
-        return replace(self, k1=0.0, k2=0.0)
+        """The same camera without distortion."""
+        return Camera(self.fx, self.fy, self.cx, self.cy, self.width, self.height)
 
     def required_pinhole(self) -> "Camera":
-        """Return itself. Raises InputError if it has radial terms: maps need a pinhole."""
+        """Return itself. Raises InputError if it has distortion: maps need a pinhole."""
         if not self.is_pinhole:
             raise InputError(
-                f"The camera bends rays (k1 {self.k1:g}, k2 {self.k2:g}); undistort its images, "
-                "and give the pinhole that sees them."
+                f"The camera bends rays (distortion {self.distortion}); undistort its images, and "
+                "give the pinhole that sees them."
             )
         return self
 
     def growth(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the factor on a ray's distance from the axis, whose square is given."""
-        return 1 + square * (self.k1 + square * self.k2)
+        """Return the factor g on a ray's distance r from the axis, given r^2."""
+        return self.radial_shapes(square)[0]
+
+    def radial_shapes(
+        self, square: Float[Tensor, "*b"]
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+        """Return the growth, and its derivatives by k1 and k2."""
+        if not self.is_fisheye:
+            over = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
+            if not (self.k4 or self.k5 or self.k6):
+                return over, square, square.square()
+            under = 1 + square * (self.k4 + square * (self.k5 + square * self.k6))
+            return over / under, square / under, square.square() / under
+        angle, bend = self._angle(square)
+        straight = angle / square.clamp(min=1e-30).sqrt()
+        straight = torch.where(square > 0, straight, 1.0)
+        second = angle.square()
+        return straight * bend, straight * second, straight * second.square()
+
+    def growth_slope(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Return twice the derivative of the growth by r^2."""
+        if not self.is_fisheye:
+            over = 2 * self.k1 + square * (4 * self.k2 + 6 * square * self.k3)
+            if not (self.k4 or self.k5 or self.k6):
+                return over
+            under = 1 + square * (self.k4 + square * (self.k5 + square * self.k6))
+            more = 2 * self.k4 + square * (4 * self.k5 + 6 * square * self.k6)
+            return (over - more * self.growth(square)) / under
+        slope = self._angle_slope(square) / (1 + square)
+        outer = (slope - self.growth(square)) / square.clamp(min=_CENTRAL)
+        return torch.where(square > _CENTRAL, outer, 2 * self.k1 - 2 / 3)
 
     def steepness(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the slope of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at
-        least ``LEAST_SLOPE``."""
-        return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=LEAST_SLOPE)
+        """Return the slope of the distorted radius, by the radius or the angle of a fisheye; the
+        image is folded over where it is not above ``LEAST_SLOPE``."""
+        if self.is_fisheye:
+            return self._angle_slope(square)
+        return self.growth(square) + square * self.growth_slope(square)
+
+    @cached_property
+    def _widest_angle(self) -> float:
+        """Angle up to which a fisheye's radius grows, at most the limit."""
+        angles = torch.linspace(0.0, FISHEYE_LIMIT, 1000, dtype=torch.float64)
+        radius = angles * self._angle(angles.tan().square())[1]
+        falls = torch.nonzero(radius.diff() <= 0)
+        return float(angles[falls[0, 0]]) if len(falls) else FISHEYE_LIMIT
+
+    def _angle(self, square: Float[Tensor, "*b"]) -> tuple[Tensor, Tensor]:
+        """Return the angle from the axis, and the factor by which a fisheye bends it."""
+        angle = square.sqrt().atan()
+        s = angle.square()
+        return angle, 1 + s * (self.k1 + s * (self.k2 + s * (self.k3 + s * self.k4)))
+
+    def _angle_slope(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Return the derivative of a fisheye's radius by the angle."""
+        s = square.sqrt().atan().square()
+        return 1 + s * (3 * self.k1 + s * (5 * self.k2 + s * (7 * self.k3 + 9 * s * self.k4)))
 
     def bent(self, plane: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """Distort points x / z, y / z; in focal lengths from the principal point."""
-        return plane * self.growth(plane.square().sum(-1, keepdim=True))
+        square = plane.square().sum(-1, keepdim=True)
+        bent = plane * self.growth(square)
+        if self.p1 or self.p2:
+            both = 2 * plane.prod(-1, keepdim=True)
+            aside = plane.new_tensor([self.p1, self.p2])
+            along = square + 2 * plane.square()
+            bent = bent + both * aside + along * aside.flip(-1)
+        return bent
 
     def straight(self, bent: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-        """Undistort to points x / z, y / z; source: Newton's method on the radius."""
+        """Undistort to points x / z, y / z; source: Newton's method on the radius, and then on the
+        point where there are tangential terms. Rays of a fisheye are at most ``FISHEYE_LIMIT`` from
+        the axis."""
         if self.is_pinhole:
             return bent
-        s = radius = bent.norm(dim=-1, keepdim=True)
-        for _ in range(8):
+        radius = bent.norm(dim=-1, keepdim=True)
+        if self.is_fisheye:
+            widest = self._widest_angle
+            angle = radius.clamp(max=widest)
+            for _ in range(2 * _RADIAL_STEPS):
+                square = angle.tan().square()
+                over = angle * self._angle(square)[1] - radius
+                step = over / self._angle_slope(square).clamp(min=LEAST_SLOPE)
+                angle = (angle - step).clamp(0.0, widest)
+            return torch.where(radius > 0, bent * (angle.tan() / radius.clamp(min=1e-30)), bent)
+        s = radius
+        for _ in range(_RADIAL_STEPS):
             square = s.square()
-            s = s - (s * self.growth(square) - radius) / self.steepness(square)
-        return bent / self.growth(s.square())
+            slope = self.steepness(square).clamp(min=LEAST_SLOPE)
+            s = s - (s * self.growth(square) - radius) / slope
+        plane = bent / self.growth(s.square())
+        for _ in range(_PLANE_STEPS if self.p1 or self.p2 else 0):
+            plane = plane + self.unbent_step(plane, bent - self.bent(plane))
+        return plane
 
     def plane(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """Return the points x / z, y / z of pixels."""
@@ -176,6 +274,10 @@ class Camera:
         x, y = self.bent(plane).unbind(-1)
         return torch.stack([self.fx * x + self.cx, self.fy * y + self.cy], -1)
 
+    def shows(self, plane: Float[Tensor, "*b 2"]) -> Bool[Tensor, "*b"]:
+        """Whether the lens does not fold points x / z, y / z over."""
+        return self.steepness(plane.square().sum(-1)) > LEAST_SLOPE
+
     def bend_jacobian(
         self, plane: Float[Tensor, "*b 2"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
@@ -183,8 +285,34 @@ class Camera:
         x, y = plane.unbind(-1)
         square = x * x + y * y
         growth = self.growth(square)
-        slope = 2 * self.k1 + 4 * self.k2 * square
-        return growth + slope * x * x, slope * x * y, growth + slope * y * y
+        slope = self.growth_slope(square)
+        xx, xy, yy = growth + slope * x * x, slope * x * y, growth + slope * y * y
+        if self.p1 or self.p2:
+            xx = xx + 2 * self.p1 * y + 6 * self.p2 * x
+            xy = xy + 2 * self.p1 * x + 2 * self.p2 * y
+            yy = yy + 6 * self.p1 * y + 2 * self.p2 * x
+        return xx, xy, yy
+
+    def bent_step(
+        self, plane: Float[Tensor, "*a 2"], step: Float[Tensor, "*b 2"]
+    ) -> Float[Tensor, "*b 2"]:
+        """Distort a small step of points x / z, y / z, to first order."""
+        if self.is_pinhole:
+            return step
+        xx, xy, yy = self.bend_jacobian(plane)
+        x, y = step.unbind(-1)
+        return torch.stack([xx * x + xy * y, xy * x + yy * y], -1)
+
+    def unbent_step(
+        self, plane: Float[Tensor, "*a 2"], step: Float[Tensor, "*b 2"]
+    ) -> Float[Tensor, "*b 2"]:
+        """Return the small step of points x / z, y / z that is seen as a ``step`` of
+        :meth:`bent`."""
+        if self.is_pinhole:
+            return step
+        xx, xy, yy = self.bend_jacobian(plane)
+        x, y = step.unbind(-1)
+        return torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / (xx * yy - xy * xy)[..., None]
 
     # --- points ----------------------------------------------------------------------------
 

@@ -109,10 +109,11 @@ __device__ __forceinline__ int cell_of(float2 pixel, float offset, float stride,
 extern "C" __global__ void __launch_bounds__(1024) carry_depth(
     const double* T, const double* T_source, const int* source, const float* inverse_depth,
     const float* information, const float* rays, int width, int height, float offset, float stride,
-    float fx, float fy, float cx, float cy, float k1, float k2, int scratch_size, float* scratch,
-    float* carried, float* carried_information, float2* there, float2* back) {
+    float fx, float fy, float cx, float cy, float k1, float k2, float p1, float p2, float k3,
+    float k4, float k5, float k6, float fisheye, int scratch_size, float* scratch, float* carried,
+    float* carried_information, float2* there, float2* back) {
   __shared__ Motion shared_motion[2];
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   int cells = width * height, job = blockIdx.x;
   size_t from = (size_t)source[job] * cells, to = (size_t)job * cells;
   if (threadIdx.x == 0) {

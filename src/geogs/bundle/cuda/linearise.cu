@@ -8,8 +8,9 @@
 extern "C" __global__ void __launch_bounds__(256) linearise_edges(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float2* pixels, const float2* weight, const float* rays, int cells, float fx, float fy,
-    float cx, float cy, float k1, float k2, float huber, double* motion, double* normal,
-    float* coupling, float* curvature, float* gradient) {
+    float cx, float cy, float k1, float k2, float p1, float p2, float k3, float k4, float k5,
+    float k6, float fisheye, float huber, double* motion, double* normal, float* coupling,
+    float* curvature, float* gradient) {
   __shared__ Motion T_ji;
   __shared__ double sums[32];
   size_t e = blockIdx.x;
@@ -24,7 +25,7 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
   }
   __syncthreads();
   Motion pose = T_ji;
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   float v[32];
 #pragma unroll
   for (int k = 0; k < 32; k++) v[k] = 0.f;
@@ -48,7 +49,8 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
 extern "C" __global__ void __launch_bounds__(256) find_edge_costs(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float2* pixels, const float2* weight, const float* rays, int cells, float fx, float fy,
-    float cx, float cy, float k1, float k2, float huber, float behind, double* cost) {
+    float cx, float cy, float k1, float k2, float p1, float p2, float k3, float k4, float k5,
+    float k6, float fisheye, float huber, float behind, double* cost) {
   __shared__ Motion T_ji;
   size_t e = blockIdx.x;
   int i = source[e];
@@ -59,7 +61,7 @@ extern "C" __global__ void __launch_bounds__(256) find_edge_costs(
   }
   __syncthreads();
   Motion pose = T_ji;
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   float sum = 0.f;
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
     Projected seen = project_cell(pose, rays, p, inverse_depth[(size_t)i * cells + p]);

@@ -34,11 +34,12 @@ __device__ void solve_step(const double* sums, double* xi) {
 extern "C" __global__ void __launch_bounds__(512) solve_poses(
     const int* first, const int* order, const float* inverse_depth, const double* T_source,
     const float2* pixels, const float2* weight, const float* information, const float* rays,
-    int cells, float fx, float fy, float cx, float cy, float k1, float k2, int iterations,
-    float huber, double* T, float2* residual) {
+    int cells, float fx, float fy, float cx, float cy, float k1, float k2, float p1, float p2,
+    float k3, float k4, float k5, float k6, float fisheye, int iterations, float huber, double* T,
+    float2* residual) {
   __shared__ double pose[12], sums[32];
   __shared__ Motion shared_motion;
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   int begin = first[blockIdx.x], end = first[blockIdx.x + 1];
   if (threadIdx.x < 12) pose[threadIdx.x] = T[16 * blockIdx.x + threadIdx.x];
   for (int n = 0; n <= iterations; n++) {
@@ -87,8 +88,8 @@ extern "C" __global__ void __launch_bounds__(512) judge_match(
     const float2* pixels, const float2* weight, const float* information,
     const float* inverse_depth, const float2* residual, const float2* grid_pixels,
     const float* rays, int cells, float fx, float fy, float cx, float cy, float k1, float k2,
-    float limit, float known, const double* T, const double* T_source, double* judgement,
-    double* T_ji) {
+    float p1, float p2, float k3, float k4, float k5, float k6, float fisheye, float limit,
+    float known, const double* T, const double* T_source, double* judgement, double* T_ji) {
   SHARED_MEMORY(u32, keys);
   __shared__ Motion motion;
   if (threadIdx.x == 0) {
@@ -118,7 +119,7 @@ extern "C" __global__ void __launch_bounds__(512) judge_match(
   }
   float median_flow = block_median(keys, cells);
   __syncthreads();
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
     if (keys[p] == LEFT_OUT) continue;
     float2 turned = pixel_of(camera, project_cell(motion, rays, p, 0.f));

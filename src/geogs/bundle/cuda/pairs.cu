@@ -16,10 +16,10 @@ __device__ __forceinline__ Motion pair_motion(const double* T, int source, int t
 extern "C" __global__ void __launch_bounds__(256) project_pairs(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float* rays, int cells, float fx, float fy, float cx, float cy, float k1, float k2,
-    float2* pixels) {
+    float p1, float p2, float k3, float k4, float k5, float k6, float fisheye, float2* pixels) {
   int i = source[blockIdx.x];
   Motion motion = pair_motion(T, i, target[blockIdx.x]);
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   for (int p = threadIdx.x; p < cells; p += blockDim.x)
     pixels[(size_t)blockIdx.x * cells + p] = pixel_of(camera, project_cell(motion, rays, p, inverse_depth[(size_t)i * cells + p]));
 }
@@ -28,11 +28,12 @@ extern "C" __global__ void __launch_bounds__(256) project_pairs(
 extern "C" __global__ void __launch_bounds__(256) moved_pairs(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float* rays, int cells, float fx, float fy, float cx, float cy, float k1, float k2,
-    const float2* before, const float2* weight, float* median) {
+    float p1, float p2, float k3, float k4, float k5, float k6, float fisheye, const float2* before,
+    const float2* weight, float* median) {
   SHARED_MEMORY(u32, keys);
   int i = source[blockIdx.x];
   Motion motion = pair_motion(T, i, target[blockIdx.x]);
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
     size_t at = (size_t)blockIdx.x * cells + p;
     float2 now = pixel_of(camera, project_cell(motion, rays, p, inverse_depth[(size_t)i * cells + p]));
@@ -47,13 +48,14 @@ extern "C" __global__ void __launch_bounds__(256) moved_pairs(
 extern "C" __global__ void __launch_bounds__(128) pair_distances(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float* rays, const float2* grid_pixels, int width, int height, int step, float fx,
-    float fy, float cx, float cy, float k1, float k2, float right, float bottom,
-    float rotation_weight, float* distance) {
+    float fy, float cx, float cy, float k1, float k2, float p1, float p2, float k3, float k4,
+    float k5, float k6, float fisheye, float right, float bottom, float rotation_weight,
+    float* distance) {
   int i = source[blockIdx.x];
   Motion motion = pair_motion(T, i, target[blockIdx.x]), shift = motion;
   for (int k = 0; k < 12; k++)
     if (k % 4 != 3) shift.m[k] = k % 5 == 0 ? 1.f : 0.f;
-  Camera camera = {fx, fy, cx, cy, k1, k2};
+  Camera camera = {fx, fy, cx, cy, LENS};
   int columns = (width + step - 1) / step, count = columns * ((height + step - 1) / step);
   float flow[2] = {0.f, 0.f}, valid[2] = {0.f, 0.f}, inside = 0.f;
   for (int n = threadIdx.x; n < count; n += blockDim.x) {

@@ -63,11 +63,11 @@ def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, 
     plane = camera.plane(pixels)
     off = pixels - pixels.new_tensor([camera.cx, camera.cy])
     flat = focal * plane
-    square = plane.square().sum(-1, keepdim=True)
+    _, by_k1, by_k2 = camera.radial_shapes(plane.square().sum(-1, keepdim=True))
     right, down = torch.zeros_like(off), torch.zeros_like(off)
     right[..., 0] = camera.fx
     down[..., 1] = camera.fy
-    return torch.stack([-off, -flat * square, -flat * square.square(), -right, -down])
+    return torch.stack([-off, -flat * by_k1, -flat * by_k2, -right, -down])
 
 
 def shifts_of_edges(

@@ -215,8 +215,7 @@ class RowErrors:
             pixels: their matches in the target.
         """
         camera = self._grid.camera
-        own = pixels.new_tensor([camera.fx, camera.fy]) * camera.bent(rays[:, :2])
-        own = (own + pixels.new_tensor([camera.cx, camera.cy])).expand_as(pixels)
+        own = camera.pixels(rays[:, :2]).expand_as(pixels)
         p = project(camera, rays, T_ji, inverse_depth)
         there = self.of_pixels(target, pixels, inverse_depth / p.z)
         here = self.of_pixels(source, own, inverse_depth)
@@ -252,9 +251,10 @@ class RowErrors:
                 inverse_depth[at],
             )
         elif rectified:
+            from geogs.geometry.bend_kernels import lens_arguments
             from geogs.tracking.frames.row_kernels import shift_pixels
 
-            camera = np.array(self._grid.camera.numbers, np.float32)
+            camera = lens_arguments(self._grid.camera)
             limits = np.array([CELL, MIN_Z], np.float32)
             factor = np.float32(self._factor)
             own = {
@@ -265,7 +265,7 @@ class RowErrors:
             each = zip(*(x.contiguous().numpy() for x in (*inputs, *found)), strict=True)
             for frame, edge in zip(frames, each, strict=True):
                 if frame in own:
-                    shift_pixels(*own[frame], camera, limits, factor, *edge)
+                    shift_pixels(*own[frame], *camera, limits, factor, *edge)
         return found
 
     def _shifted(
@@ -283,7 +283,6 @@ class RowErrors:
         times = torch.stack([f.times for f in rectified]).to(pixels)[at]
         weights, changes = lagrange(times, self._factor * seconds)
         focal = pixels.new_tensor([camera.fx, camera.fy])
-        centre = pixels.new_tensor([camera.cx, camera.cy])
         plane = camera.plane(pixels)
         rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
         moved = torch.zeros_like(plane)
@@ -293,12 +292,9 @@ class RowErrors:
             there = y[..., :2] / z[..., None]
             moved += weights[j][..., None] * there
             change += changes[j][..., None] * there
-        xx, xy, yy = camera.bend_jacobian(moved)
-        x, y = change.unbind(-1)
-        bent_change = torch.stack([xx * x + xy * y, xy * x + yy * y], -1)
         return RowShifts(
-            pixels + offset - (camera.bent(moved) * focal + centre),
-            -seconds[..., None] * bent_change * focal,
+            pixels + offset - camera.pixels(moved),
+            -seconds[..., None] * camera.bent_step(moved, change) * focal,
         )
 
 

@@ -6,20 +6,22 @@ It replaces some two hundred small PyTorch operations; edges have some thousands
 import numpy as np
 from numba import njit
 
+from geogs.geometry.bend_kernels import FAST, aside_at, growth_at
+
 _NODES = 5
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-_TWO, _FOUR = np.float32(2.0), np.float32(4.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})
+@njit(**FAST)
 def shift_pixels(
-    field, times, motions, camera, limits, factor, pixels, plane, inverse_depth, shift, slope
+    field, times, motions, camera, more, limits, factor, pixels, plane, inverse_depth, shift, slope
 ):
     """Fill ``shift`` and ``slope`` (p, 2), see :meth:`RowErrors.of_pixels`.
 
     Of the frame: ``field`` (r, c, 3) of offsets and seconds, times (5) of the nodes and motions
-    (5, 4, 4) to them. ``camera``: fx, fy, cx, cy, k1, k2; ``limits``: pixels of a cell of the field
-    and the least z. Then the factor on the readout, pixels (p, 2), their points on the plane z = 1
+    (5, 4, 4) to them. ``camera``: fx, fy, cx, cy, k1, k2, and ``more`` of it or None
+    (:mod:`geogs.geometry.bend_kernels`); ``limits``: pixels of a cell of the field and the least z.
+    Then the factor on the readout, pixels (p, 2), their points on the plane z = 1
     (p, 2) and inverse depths (p); all float32.
     """
     fx = camera[0]
@@ -75,9 +77,12 @@ def shift_pixels(
             along += change * X
             across += change * Y
         square = u * u + v * v
-        growth = _ONE + square * (k1 + square * k2)
-        turned = (_TWO * k1 + _FOUR * k2 * square) * (u * along + v * across)
-        shift[n, 0] += pixels[n, 0] - (u * growth * fx + cx)
-        shift[n, 1] += pixels[n, 1] - (v * growth * fy + cy)
-        slope[n, 0] = -seconds[n] * (along * growth + u * turned) * fx
-        slope[n, 1] = -seconds[n] * (across * growth + v * turned) * fy
+        growth, bent, _, _, _ = growth_at(square, k1, k2, more)
+        aside_x, aside_y, xx, xy, yy = aside_at(u, v, more)
+        turned = bent * (u * along + v * across)
+        bent_along = along * growth + u * turned + xx * along + xy * across
+        bent_across = across * growth + v * turned + xy * along + yy * across
+        shift[n, 0] += pixels[n, 0] - ((u * growth + aside_x) * fx + cx)
+        shift[n, 1] += pixels[n, 1] - ((v * growth + aside_y) * fy + cy)
+        slope[n, 0] = -seconds[n] * bent_along * fx
+        slope[n, 1] = -seconds[n] * bent_across * fy
