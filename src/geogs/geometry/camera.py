@@ -274,6 +274,10 @@ class Camera:
         x, y = self.bent(plane).unbind(-1)
         return torch.stack([self.fx * x + self.cx, self.fy * y + self.cy], -1)
 
+    def as_pinhole(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Return where the same camera without distortion sees what is at some pixels."""
+        return pixels if self.is_pinhole else self.pinhole.pixels(self.plane(pixels))
+
     def shows(self, plane: Float[Tensor, "*b 2"]) -> Bool[Tensor, "*b"]:
         """Whether the lens does not fold points x / z, y / z over."""
         return self.steepness(plane.square().sum(-1)) > LEAST_SLOPE

@@ -84,7 +84,8 @@ class TwoViewVerifier:
         pairs = self._match(first.features, second.features)
         if len(pairs) < MIN_INLIERS:
             return TwoViewMatch(False, f"only {len(pairs)} features match", matches=len(pairs))
-        a, b = first.features.pixels[pairs[:, 0]], second.features.pixels[pairs[:, 1]]
+        seen = first.features.pixels[pairs[:, 0]], second.features.pixels[pairs[:, 1]]
+        a, b = (self.camera.as_pinhole(torch.from_numpy(pixels)).numpy() for pixels in seen)
         depth = None if first.depth is None else first.depth[pairs[:, 0]]
         if depth is not None and int((depth > 0).sum()) >= MIN_INLIERS:
             a, b, pairs, depth = (x[depth > 0] for x in (a, b, pairs, depth))

@@ -238,14 +238,13 @@ def _view_planes(
 ) -> tuple[Float[Tensor, "m 5 3"], Float[Tensor, "m 5"]]:
     """Return inward normals n and offsets o of each view's frustum: n . x + o >= 0 within."""
     c = camera
+    right, bottom = c.width - 1, c.height - 1
+    border = [[0, 0], [c.cx, 0], [right, 0], [0, c.cy], [right, c.cy], [0, bottom], [c.cx, bottom],
+              [right, bottom]]  # fmt: skip
+    seen = c.plane(torch.tensor(border, dtype=torch.float64))
+    (left, up), (far_right, down) = seen.amin(0).tolist(), seen.amax(0).tolist()
     planes = torch.tensor(
-        [
-            [c.fx, 0, c.cx],
-            [-c.fx, 0, c.width - 1 - c.cx],
-            [0, c.fy, c.cy],
-            [0, -c.fy, c.height - 1 - c.cy],
-            [0, 0, 1],
-        ],
+        [[1, 0, -left], [-1, 0, far_right], [0, 1, -up], [0, -1, down], [0, 0, 1]],
         dtype=torch.float64,
     )
     planes = planes / planes.norm(dim=1, keepdim=True)

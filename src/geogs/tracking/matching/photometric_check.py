@@ -70,7 +70,7 @@ def correlation_at(
     which may be on the CPU, are on the grid's device; so is the result, and nothing waits for a
     GPU.
     """
-    if grid.on_gpu:
+    if grid.on_gpu and grid.camera.is_pinhole:
         from geogs.tracking.cuda.photometric_check import median_correlation
 
         step = _spread(grid).step
@@ -128,13 +128,14 @@ def reprojected_windows(
     """
     c = grid.camera
     some = _spread(grid)
-    R = T_ji[:3, :3].to(grid.rays)
-    t = T_ji[:3, 3].to(grid.rays)
-    middle = grid.rays[some] @ R.mT + inverse_depth[some, None] * t
-    around = _offsets(grid) @ torch.stack([R[:, 0] / c.fx, R[:, 1] / c.fy])
+    rays = grid.rays[some]
+    R = T_ji[:3, :3].to(rays)
+    middle = rays @ R.mT + inverse_depth[some, None] * T_ji[:3, 3].to(rays)
+    offsets = (_offsets(grid) / rays.new_tensor([c.fx, c.fy])).expand(len(rays), -1, -1)
+    around = c.unbent_step(rays[:, None, :2], offsets) @ R[:, :2].mT
     x, y, z = (middle[:, None] + around).unbind(-1)
     z = torch.where(z > 1e-6, z, torch.nan)
-    return torch.stack([c.fx * x / z + c.cx, c.fy * y / z + c.cy], -1)
+    return c.pixels(torch.stack([x / z, y / z], -1))
 
 
 def _median_correlation(

@@ -32,11 +32,10 @@ def pnp_features(
     """Estimate the pose T_ji of a view from features of a keyframe, with depths of their cells."""
     cell, inside = grid.cells_of(matches.first.to(grid.device))
     known = inside & (keyframe.information[cell] > 0)
-    c = grid.camera
-    p = matches.first.to(grid.device)
-    rays = torch.stack([(p[:, 0] - c.cx) / c.fx, (p[:, 1] - c.cy) / c.fy, p[:, 0] * 0 + 1], -1)
+    plane = grid.camera.plane(matches.first.to(grid.device))
+    rays = torch.cat([plane, torch.ones_like(plane[:, :1])], -1)
     points = (rays / keyframe.inverse_depth[cell, None])[known]
-    return _pnp(c, points, matches.second.to(grid.device)[known], MIN_POINTS[1])
+    return _pnp(grid.camera, points, matches.second.to(grid.device)[known], MIN_POINTS[1])
 
 
 def _pnp(
@@ -47,7 +46,7 @@ def _pnp(
         return None
     ok, rotation, translation, inliers = cv2.solvePnPRansac(
         points.double().cpu().numpy(),
-        pixels.double().cpu().numpy(),
+        camera.as_pinhole(pixels.double().cpu()).numpy(),
         camera.matrix().numpy(),
         None,
         iterationsCount=200,

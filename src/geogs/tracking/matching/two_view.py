@@ -151,7 +151,7 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     if found is None:
         return None
     T, inliers = found
-    p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
+    p, q = _straight_pixels(camera, match)
     K = camera.matrix().numpy()
     count = len(p)
     homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p[inliers].T, q[inliers].T)
@@ -182,7 +182,7 @@ def relative_pose(
     used = match.sure()[0].numpy()
     if used.sum() < 0.1 * len(used):
         return None
-    p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
+    p, q = _straight_pixels(camera, match)
     K = camera.matrix().numpy()
     try:
         E, mask = cv2.findEssentialMat(p[used], q[used], K, cv2.USAC_MAGSAC, 0.9999, 0.7)
@@ -198,6 +198,26 @@ def relative_pose(
     T[:3, :3] = R
     T[:3, 3] = t
     return T, agreeing[in_front]
+
+
+def as_pinhole(camera: Camera, match: FlowMatch) -> FlowMatch:
+    """Return the matches that the same camera without distortion would find: at the pixels where it
+    sees them, with variances by its magnification there."""
+    if camera.is_pinhole:
+        return match
+    plane = camera.plane(match.pixels)
+    xx, xy, yy = camera.bend_jacobian(plane)
+    weight = match.weight * (xx * yy - xy * xy).abs()[..., None]
+    return FlowMatch(camera.pinhole.pixels(plane), weight)
+
+
+def _straight_pixels(
+    camera: Camera, match: FlowMatch
+) -> tuple[Float64[np.ndarray, "p 2"], Float64[np.ndarray, "p 2"]]:
+    """Return pixels of the cells and of their matches without distortion."""
+    both = SampleGrid(camera).pixels, match.pixels[0]
+    first, second = (camera.as_pinhole(pixels.double()).numpy() for pixels in both)
+    return first, second
 
 
 def rays_through(

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs.tracking.matching.two_view import rays_through, relative_pose
+from geogs.tracking.matching.two_view import as_pinhole, rays_through, relative_pose
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -110,6 +110,7 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     shrinks from step to step. None where fewer than eight cells are matched.
     """
     camera = grid.camera
+    match = as_pinhole(camera, match)
     used = (match.weight[0, :, 0] > 0).cpu().numpy()
     if used.sum() < 8:
         return None
@@ -144,6 +145,7 @@ def epipolar_squares(
 ) -> Float64[np.ndarray, "n"]:
     """Return squared epipolar distances of the matched cells, in the flow's variances."""
     camera = grid.camera
+    match = as_pinhole(camera, match)
     used = match.weight[0, :, 0] > 0
     t = T_ji[:3, 3].double().numpy()
     R = T_ji[:3, :3].double().numpy()
