@@ -5,10 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from geogs.camera.distortion import LensModel, undistorted_rays
+from geogs.camera.distortion import LensModel
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
 from geogs.types import Frame
+from lenses import undistorted_rays
 from tracking_scenes import CAMERA, render, seen
 
 Path = Callable[[float], np.ndarray]

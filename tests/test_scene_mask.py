@@ -22,7 +22,7 @@ def keyframe(image: np.ndarray, lens: FoundLens | None) -> Keyframe:
 
 
 def test_what_a_lens_did_not_see_is_masked_out():
-    grey, seen = np.full((120, 160, 3), 90, np.uint8), StraightView(CAMERA, WIDE).is_seen
+    grey, seen = np.full((120, 160, 3), 90, np.uint8), StraightView(CAMERA, CAMERA, WIDE).is_seen
     assert SceneMask().of(keyframe(grey, None)) is None
     assert np.array_equal(SceneMask().of(keyframe(grey, WIDE)), seen)
     assert SceneMask().of(keyframe(grey, FoundLens(-0.1, 0.0, 0.001, 0.001))) is None
@@ -31,7 +31,7 @@ def test_what_a_lens_did_not_see_is_masked_out():
 def test_a_mask_is_straightened_as_images_are():
     grey, fixed = np.full((120, 160, 3), 90, np.uint8), np.ones((120, 160), bool)
     fixed[90:, 20:60] = False
-    view = StraightView(CAMERA, WIDE)
+    view = StraightView(CAMERA, CAMERA, WIDE)
     assert np.array_equal(SceneMask(fixed).of(keyframe(grey, None)), fixed)
     valid = SceneMask(fixed).of(keyframe(grey, WIDE))
     assert np.array_equal(valid, view.is_seen & view.nearest(fixed))
@@ -39,6 +39,6 @@ def test_a_mask_is_straightened_as_images_are():
     black = grey.copy()
     black[:10] = 0
     straight = view.image(black)
-    both = SceneMask(fixed, True).of(keyframe(straight, WIDE))
+    both = SceneMask(fixed, True).of(keyframe(black, WIDE))
     assert np.array_equal(both, valid & (straight.max(-1) > 0))
     assert int((both != valid).sum()) > 100

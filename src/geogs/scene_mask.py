@@ -29,7 +29,7 @@ class SceneMask:
             fixed = self._straight(view)
         if not self.black_is_masked:
             return fixed
-        valid = valid_pixels(keyframe.image)
+        valid = valid_pixels(keyframe.straight_image)
         if fixed is not None:
             valid &= fixed
         return None if valid.all() else valid

@@ -56,11 +56,12 @@ class Slam(SlamOutput):
         defers_map: bool = False,
         world: World | None = None,
         focal_deviation: float = 0.0,
+        pinhole: Camera | None = None,
     ) -> None:
         """Start a new system, or continue with the ``world`` of another.
 
         Args:
-            camera: pinhole of all images, which are undistorted.
+            camera: of all images, with its lens; they need not be undistorted.
             config: all settings; the defaults if none.
             device: auto (a GPU where there is one), cpu, cuda or cuda:1.
             prior: monocular prior, applied to every keyframe.
@@ -73,9 +74,11 @@ class Slam(SlamOutput):
             focal_deviation: relative standard deviation of a focal length that was not given, but
                 estimated from the video or guessed; it is then estimated again from all matches at
                 the end.
+            pinhole: of the map and of depth maps, of the images' size; default: what of the
+                images fits into a straight one.
 
         Raises:
-            InputError: images of that size cannot be tracked, the camera is no pinhole, or the
+            InputError: images of that size cannot be tracked, the lens folds them over, or the
                 world belongs to another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
@@ -90,10 +93,10 @@ class Slam(SlamOutput):
         scene_mask = SceneMask(mask, black_is_masked)
         stream = urgent_stream(where) if live else None
         with torch.cuda.stream(stream):
-            grid = SampleGrid(camera.required_pinhole(), where)
+            grid = SampleGrid(camera, where)
             operator = build_operator(c.tracking, grid, mask, black_is_masked)
             keyframes = self.world.keyframes.attached(
-                grid, operator.encode, c.resident_keyframes, focal_deviation
+                grid, operator.encode, c.resident_keyframes, focal_deviation, pinhole
             )
             check_world(self.world)
             self.segments = Segments(self.world.segments, keyframes, operator, c, prior, live)
@@ -119,8 +122,8 @@ class Slam(SlamOutput):
         Ctrl-C in a program without a handler of its own waits for the end of the image.
 
         Args:
-            image: RGB, uint8, height x width x 3, undistorted, of the camera's size, as an array
-                or a tensor; or a :class:`geogs.Frame`, which has its own timestamp.
+            image: RGB, uint8, height x width x 3, of the camera's size and with its lens, as an
+                array or a tensor; or a :class:`geogs.Frame`, which has its own timestamp.
             timestamp: seconds, later than that of the image before; without it images come 30
                 times a second.
 

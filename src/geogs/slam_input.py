@@ -56,7 +56,7 @@ def input_frame(
     """Make a frame from an image.
 
     Args:
-        image: RGB, uint8, undistorted, of the camera's size; or a frame.
+        image: RGB, uint8, of the camera's size; or a frame.
         timestamp: seconds, later than ``previous``, the last frame's; ignored for a frame, which
             has its own. If None, images come 30 times a second.
         index: position in the stream.

@@ -55,7 +55,7 @@ class SlamOutput:
 
     @property
     def camera(self) -> Camera:
-        """Pinhole of all images."""
+        """Pinhole of the map and of straight images."""
         return self.world.keyframes.camera
 
     @property

@@ -87,7 +87,7 @@ class FlowMatch:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Frame(ShortRepr):
-    """One undistorted image of the source at working resolution."""
+    """One image of the source at working resolution."""
 
     index: int
     """Position in the source after start, stop and stride; 0, 1, 2, ..."""
@@ -135,17 +135,17 @@ class MetricScale:
 
 @dataclass(frozen=True, slots=True)
 class FoundLens:
-    """Distortion (OpenCV's k1 and k2) and focal length estimated from all matches, for images that
-    were assumed to be those of a pinhole.
+    """Changes of an assumed camera that were estimated from all matches; none by default.
 
-    A ray (x, y) was seen at focal (1 + k1 r^2 + k2 r^4) (x, y) from the principal point.
+    They are to be made by :meth:`geogs.geometry.camera.Camera.moved`.
     """
 
-    k1: float
-    k2: float
-    deviation_k1: AtLeast0
+    k1: float = 0.0
+    k2: float = 0.0
+    """Added to the radial terms."""
+    deviation_k1: AtLeast0 = 0.0
     """Standard deviation."""
-    deviation_k2: AtLeast0
+    deviation_k2: AtLeast0 = 0.0
     focal: Positive = 1.0
     """Focal length over the assumed one; 1 where it was not changed."""
     deviation_focal: AtLeast0 = 0.0

@@ -22,6 +22,7 @@ from geogs.config import InputConfig
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.pose_estimate import PoseEstimate
 from geogs.types import FoundLens
+from lenses import with_lens
 from posed_scene import vertices
 
 pytestmark = pytest.mark.system
@@ -230,7 +231,7 @@ def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, 
     time = saved.keyframes[3].timestamp
     shown = next(f for f in plain if f.timestamp == pytest.approx(time))
     camera = plain.camera
-    maps = lens_maps(camera, camera, (0.1, -0.05, 0.0, 0.0), "polynomial")
+    maps = lens_maps(camera, with_lens(camera, (0.1, -0.05, 0.0, 0.0)))
     straight = cv2.remap(shown.image, *maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
     off = np.abs(saved.image(3).astype(float) - straight).mean()
     assert off < 0.3 * np.abs(shown.image.astype(float) - straight).mean()

@@ -49,7 +49,7 @@ def test_a_room_through_the_lens_becomes_that_of_the_pinhole():
         )
 
     assert farthest(bent) > 1.5
-    assert farthest(StraightView(CAMERA, strong).image(bent)) < 0.25
+    assert farthest(StraightView(CAMERA, CAMERA, strong).image(bent)) < 0.25
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_room_through_the_lens_becomes_that_of_the_pinhole():
 )
 def test_what_a_pixel_shows_is_taken_where_the_lens_shows_it(focal, right, down):
     lens = replace(LENS, focal=focal, right=right, down=down)
-    view = StraightView(CAMERA, lens)
+    view = StraightView(CAMERA, CAMERA, lens)
     u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
     straight = view.image(np.stack([u, v, 0.5 * (u + v)], -1).astype(np.uint8))
     nearest = view.nearest(np.stack([u, v], -1))
@@ -71,13 +71,13 @@ def test_what_a_pixel_shows_is_taken_where_the_lens_shows_it(focal, right, down)
 
 @pytest.mark.parametrize(("focal", "right"), [(1.0, 0.0), (0.95, 0.0), (0.95, 0.04)])
 def test_points_come_back_from_the_lens(focal, right):
-    view = StraightView(CAMERA, replace(LENS, focal=focal, right=right, down=-0.02))
+    view = StraightView(CAMERA, CAMERA, replace(LENS, focal=focal, right=right, down=-0.02))
     pixels = torch.tensor([[c, r] for r, c in PLACES], dtype=torch.float64)[None]
     np.testing.assert_allclose(view.straight(view.bent(pixels)), pixels, atol=1e-3)
 
 
 def test_where_a_polynomial_turns_back_nothing_is_shown():
-    view = StraightView(CAMERA, FoundLens(0.0, -0.6, 0.001, 0.001))  # farthest at r = 0.76
+    view = StraightView(CAMERA, CAMERA, FoundLens(0.0, -0.6, 0.001, 0.001))  # farthest at r = 0.76
     shown = view.straight(torch.tensor([[159.0, 59.5], [100.0, 59.5]], dtype=torch.float64))
     assert shown.isfinite().all(-1).tolist() == [False, True]
 
@@ -85,7 +85,7 @@ def test_where_a_polynomial_turns_back_nothing_is_shown():
 def test_black_stays_black():
     image = np.full((120, 160, 3), 200, np.uint8)
     image[:, :40] = 0
-    straight = StraightView(CAMERA, LENS).image(image)
+    straight = StraightView(CAMERA, CAMERA, LENS).image(image)
     for row in (10, 60, 110):
         black = [round(seen(row, column, LENS)[0]) < 40 for column in range(160)]
         assert (straight[row].max(-1) == 0).tolist() == black
@@ -93,13 +93,13 @@ def test_black_stays_black():
 
 def test_what_the_lens_did_not_see_is_known():
     wide = FoundLens(0.1, 0.1, 0.001, 0.001)  # shows the rim farther out than the pinhole has it
-    is_seen = StraightView(CAMERA, wide).is_seen
+    is_seen = StraightView(CAMERA, CAMERA, wide).is_seen
     for row in (0, 30, 60, 119):
         for column in (0, 3, 80, 150, 159):
             u, v = seen(row, column, wide)
             assert is_seen[row, column] == (-0.5 <= u <= 159.5 and -0.5 <= v <= 119.5)
     assert 0.7 < is_seen.mean() < 0.99
-    assert StraightView(CAMERA, FoundLens(-0.1, 0.0, 0.001, 0.001)).is_seen.all()
+    assert StraightView(CAMERA, CAMERA, FoundLens(-0.1, 0.0, 0.001, 0.001)).is_seen.all()
 
 
 def test_the_lens_is_that_of_the_matches():
@@ -110,12 +110,12 @@ def test_the_lens_is_that_of_the_matches():
     shapes = lens_shapes(CAMERA, pixels)
     wanted = lens.k1 * shapes[1] + lens.k2 * shapes[2]
     wanted = wanted + lens.right * shapes[3] + lens.down * shapes[4]
-    bent = StraightView(CAMERA, lens).bent(pixels)
+    bent = StraightView(CAMERA, CAMERA, lens).bent(pixels)
     np.testing.assert_allclose(pixels - bent, wanted, atol=1e-4)
 
 
 def test_what_a_frame_has_of_its_own_is_taken_off():
-    views = FrameViews(StraightView(CAMERA, LENS), {7: FrameLens(0.02, 0.03, -0.02)})
+    views = FrameViews(StraightView(CAMERA, CAMERA, LENS), {7: FrameLens(0.02, 0.03, -0.02)})
 
     def shown(view: StraightView) -> np.ndarray:
         """Waves, as a lens shows them to which the pinhole's pixels bend."""

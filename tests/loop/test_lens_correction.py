@@ -144,7 +144,7 @@ def test_the_end_of_tracking_straightens_images_once():
     assert (lens.k1, lens.k2) == pytest.approx(BEND, rel=0.1)
     assert 0 < lens.deviation_k1 < 0.02
     straight = tracker.keyframes[3].image
-    assert np.array_equal(straight, StraightView(CAMERA, lens).image(image_of(3)))
+    assert np.array_equal(straight, StraightView(CAMERA, CAMERA, lens).image(image_of(3)))
     assert centre_error(tracker, truth) < 1.1 * by_a_lens
     wanted = tracker.map.graph.operator.d
     for keyframe in tracker.keyframes:
@@ -233,7 +233,7 @@ def test_a_principal_point_is_found_where_nobody_told_of_the_lens():
     assert 0 < lens.deviation_centre < 0.02
     assert lens.focal == pytest.approx(1 / 1.03, abs=0.012)
     straight = tracker.keyframes[3].image
-    assert np.array_equal(straight, StraightView(CAMERA, lens).image(image_of(3)))
+    assert np.array_equal(straight, StraightView(CAMERA, CAMERA, lens).image(image_of(3)))
 
 
 @pytest.mark.system

@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from geogs.camera.shutter.rows import CELL, node_count
-from geogs.camera.straight_view import FrameViews, StraightView
+from geogs.camera.straight_view import StraightView
 from geogs.geometry.camera import Camera
-from geogs.loop.global_bundle import straighten
 from geogs.tracking.frames.seen_rows import straight_rows
 from geogs.types import FoundLens, SeenRows
 from geogs.world.grid import SampleGrid
@@ -16,7 +15,7 @@ from geogs.world.keyframes import KeyframeSet, KeyframeTable
 
 CAMERA = Camera(fx=110.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 GRID = SampleGrid(CAMERA)
-VIEW = StraightView(CAMERA, FoundLens(0.1, -0.2, 0.001, 0.002, 0.97, 0.01))
+VIEW = StraightView(CAMERA, CAMERA, FoundLens(0.1, -0.2, 0.001, 0.002, 0.97, 0.01))
 NORMAL, OFFSET = torch.tensor([0.3, 0.2, 1.0]), 2.5
 
 
@@ -26,8 +25,8 @@ def inverse_depth(pixels: Tensor) -> Tensor:
     return (plane @ NORMAL[:2] + NORMAL[2]) / OFFSET
 
 
-def one_keyframe(image: np.ndarray | None = None, encode=None) -> KeyframeSet:
-    keyframes = KeyframeTable.on(GRID, encode).new_set()
+def one_keyframe(image: np.ndarray | None = None) -> KeyframeSet:
+    keyframes = KeyframeTable.on(GRID).new_set()
     blank = np.zeros((120, 160, 3), np.uint8)
     keyframes.add(0, 0.0, blank if image is None else image, None, torch.eye(4).double())
     return keyframes
@@ -93,13 +92,14 @@ def test_rows_are_those_that_straight_pixels_were_seen_in():
 def test_images_are_those_of_the_pinhole_and_normals_and_depths_go_along():
     rng = np.random.default_rng(0)
     image = rng.integers(1, 255, (120, 160, 3), dtype=np.uint8)
-    keyframes = one_keyframe(image, encode=lambda image: float(image.mean()))
+    keyframes = one_keyframe(image)
     depth = rng.uniform(1, 4, (120, 160)).astype(np.float32)
     keyframes[0].sensor_depth = depth
     keyframes[0].prior_normal = torch.from_numpy(np.repeat(depth[..., None], 3, 2))
-    straighten(keyframes, FrameViews(VIEW))
-    assert np.array_equal(keyframes[0].image, VIEW.image(image))
-    assert keyframes[0].encoded == float(VIEW.image(image).mean())
+    keyframes.table.straighten(VIEW.lens, {})
+    assert np.array_equal(keyframes[0].image, image)
+    assert np.array_equal(keyframes[0].straight_image, VIEW.image(image))
+    assert np.array_equal(keyframes.table.reader(0)(), VIEW.image(image))
     np.testing.assert_allclose(keyframes[0].sensor_depth, VIEW.nearest(depth), rtol=1e-3)
     np.testing.assert_allclose(keyframes[0].prior_normal[..., 1], VIEW.nearest(depth), rtol=1e-3)
     assert keyframes.table.lens == VIEW.lens

@@ -3,11 +3,9 @@
 import numpy as np
 import torch
 
-from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.loop.global_bundle import straighten
 from geogs.mapping.view_arrays import MapCameras
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid
@@ -42,10 +40,9 @@ def test_views_have_the_images_that_took_the_places_of_others():
     image = np.random.default_rng(0).integers(1, 255, (48, 64, 3), np.uint8)
     view = views.add(segment.add(0, 0.0, image, None, torch.eye(4, dtype=torch.float64)).id)
     before, segments = view.depth_view.grey.copy(), view.bare_segments
-    view_of_lens = StraightView(CAMERA, FoundLens(0.3, 0.1, 0.01, 0.01))
-    straighten(segment, FrameViews(view_of_lens))
+    store.straighten(FoundLens(0.3, 0.1, 0.01, 0.01), {})
     views.arrays.forget_images()
-    assert np.array_equal(view.depth_view.image, segment[0].image)
+    assert np.array_equal(view.depth_view.image, segment[0].straight_image)
     assert not np.array_equal(view.depth_view.image, image)
     assert not np.array_equal(view.depth_view.grey, before)
     assert view.bare_segments is not segments

@@ -23,7 +23,7 @@ def errors(room: Path) -> np.ndarray:
     T_wc = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)
     source = open_source((room,), InputConfig())
     poses = [None if k in LOST else np.linalg.inv(T) for k, T in enumerate(T_wc)]
-    seen_by = as_seen(StraightView.of_pinhole(source.camera))
+    seen_by = as_seen(StraightView(source.camera, source.camera))
     found = place_lost(list(source), poses, seen_by, 0, lambda *_: None)
     assert set(found.numbers) == set(LOST)
     centres = np.linalg.inv(found.T_cw)[:, :3, 3]

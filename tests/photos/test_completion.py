@@ -25,10 +25,10 @@ def test_the_nearest_known_frames_on_both_sides():
 
 def test_a_lens_that_was_found_since_is_in_the_calibration():
     camera = render_room(1, 1, 32, 24).camera
-    bent = as_seen(StraightView(camera, FoundLens(0.1, -0.2, 0.01, 0.01, 1.02)))
+    bent = as_seen(StraightView(camera, camera, FoundLens(0.1, -0.2, 0.01, 0.01, 1.02)))
     assert bent.fx == pytest.approx(1.02 * camera.fx)
     assert bent.distortion == (0.1, -0.2, 0.0, 0.0)
-    assert as_seen(StraightView.of_pinhole(camera)).distortion == ()
+    assert as_seen(StraightView(camera, camera)).distortion == ()
 
 
 def test_what_is_found_is_as_unsure_as_what_is_around_and_by_itself():
@@ -47,7 +47,7 @@ def test_known_frames_are_shown_as_the_lens_of_all_saw_them(monkeypatch, tmp_pat
     room = render_room(4, 1, 32, 24)
     own = FrameLens(right=0.05)
     wander = FoundLens(0.0, 0.0, 0.0, 0.0, varies_centre=0.03)
-    views = FrameViews(StraightView(room.camera, wander), {1: own, 2: own})
+    views = FrameViews(StraightView(room.camera, room.camera, wander), {1: own, 2: own})
     for k, image in enumerate(room.images):
         write_image(tmp_path / f"{k}.png", image)
     camera = ",".join(str(getattr(room.camera, k)) for k in ("fx", "fy", "cx", "cy"))
@@ -81,7 +81,7 @@ def test_lost_frames_are_placed_and_those_of_another_room_are_not():
     frames = [Frame(k, k / 10, image) for k, image in enumerate(images)]
     poses = [room.T_cw[k] if k < 6 else None for k in range(len(frames))]
     found = place_lost(
-        frames, poses, as_seen(StraightView.of_pinhole(room.camera)), 0, lambda *_: None
+        frames, poses, as_seen(StraightView(room.camera, room.camera)), 0, lambda *_: None
     )
     assert found.numbers == (6, 7, 8)
     centres = np.linalg.inv(found.T_cw)[:, :3, 3]
@@ -94,7 +94,7 @@ def test_lost_frames_are_placed_and_those_of_another_room_are_not():
         place_lost(
             frames[:3],
             [None] * 3,
-            as_seen(StraightView.of_pinhole(room.camera)),
+            as_seen(StraightView(room.camera, room.camera)),
             0,
             lambda *_: None,
         )

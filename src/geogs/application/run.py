@@ -136,7 +136,7 @@ def _metadata(settings: RunSettings, driver: Driver, opened: Source, source: Sou
 
 
 def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
-    """Open the sources; to continue a map with an estimated lens, in its keyframes' pinhole."""
+    """Open the sources; to continue a map, straight and in its keyframes' pinhole."""
     given = settings.config.input
     if base is None:
         return open_source(settings.source, given)
@@ -146,11 +146,11 @@ def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
 def opened_in(
     base: SavedResult, given: InputConfig, opener: Callable[[InputConfig], Source]
 ) -> Source:
-    """Open a source in the pinhole of a map's keyframes, if its lens is not given."""
+    """Open a source, straight, and in the pinhole of a map's keyframes if its lens is not given."""
     known = base.folder / "intrinsics.json"
     if given.intrinsics.strip().lower() != "auto" or not known.is_file():
-        return opener(given)
-    opened = opener(replace(given, intrinsics=str(known)))
+        return opener(given).straight()
+    opened = opener(replace(given, intrinsics=str(known))).straight()
     focal = base.camera.fx
     is_same = math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
     return opened if is_same or given.working_field_of_view != "auto" else opened.with_focal(focal)
@@ -205,7 +205,7 @@ def resume(
     settings = continued(saved.metadata, settings or saved.settings, output)
     device = require_device(settings.device)
     opened = without_overlay(open_source(settings.source, settings.config.input))
-    source = saved.calibrated(opened)
+    source = saved.calibrated(opened if settings.map is None else opened.straight())
     with claimed(output) as folder, compiling(device) as kernels:
         compile_gpu_kernels(device)
         prior = open_prior(settings.config.prior, source.camera, device)

@@ -76,7 +76,7 @@ def new_slam(
 ) -> Slam:
     """Make a system for the frames of a source, or continue with the ``world`` of another."""
     return Slam(
-        source.camera,
+        source.image_camera,
         config,
         str(device),
         prior,
@@ -86,6 +86,7 @@ def new_slam(
         defers_map,
         world,
         source.calibration.focal_deviation,
+        source.camera,
     )
 
 

@@ -2,9 +2,9 @@
 
 Arrays are C-contiguous and float32, except sums over cells, which are float64: motions to the
 targets (e, 3, 4), rays of the cells (2, p) with z = 1, the lens (6) as fx, fy, cx, cy, k1 and k2,
-and more of it or None (:mod:`geogs.geometry.bend_kernels`), inverse depths (p), measured positions and their weights (e, p, 2). The kernels release the
-interpreter lock. Chains of small PyTorch operations take ten times as long, and threads that call
-them wait for each other.
+and more of it or None (:mod:`geogs.geometry.bend_kernels`), inverse depths (p), measured positions
+and their weights (e, p, 2). The kernels release the interpreter lock. Chains of small PyTorch
+operations take ten times as long, and threads that call them wait for each other.
 """
 
 import numpy as np
@@ -40,9 +40,7 @@ def _dot(left, right):
 
 
 @njit(**_PART)
-def _derivatives(
-    motion, rays, slopes, lens, more, inverse_depth, pixels, weight, limits, J, r, w
-):
+def _derivatives(motion, rays, slopes, lens, more, inverse_depth, pixels, weight, limits, J, r, w):
     """Compute derivatives of some cells for :func:`linearise_source`: the x of all, then the y. The
     last row of ``J`` is by the inverse depth."""
     huber = limits[0]

@@ -1,4 +1,4 @@
-"""Mapping between the pixels of an estimated lens and those of the pinhole assumed before."""
+"""Mapping between the pixels of images as they came and those of the pinhole of a map."""
 
 import math
 from collections.abc import Mapping
@@ -18,27 +18,20 @@ from geogs.types import FoundLens, FrameLens
 
 @dataclass(frozen=True)
 class StraightView:
-    """A pinhole, and the lens that took its images."""
+    """A pinhole, and the camera that took the images."""
 
     camera: Camera
-    """The assumed pinhole."""
-    lens: FoundLens
-
-    @staticmethod
-    def of_pinhole(camera: Camera) -> "StraightView":
-        """Return the view of images without distortion."""
-        return StraightView(camera, FoundLens(0.0, 0.0, 0.0, 0.0))
+    """The pinhole of the straight images."""
+    assumed: Camera
+    """The camera of the images, as it was assumed."""
+    lens: FoundLens = field(default_factory=FoundLens)
+    """What was found of its lens since."""
 
     @cached_property
     def seen_by(self) -> Camera:
-        """The camera with the lens."""
+        """The camera of the images."""
         lens = self.lens
-        return self.camera.moved(math.log(lens.focal), lens.k1, lens.k2, lens.right, lens.down)
-
-    @property
-    def distortion(self) -> tuple[float, float, float, float]:
-        """OpenCV's k1, k2, p1, p2."""
-        return self.lens.k1, self.lens.k2, 0.0, 0.0
+        return self.assumed.moved(math.log(lens.focal), lens.k1, lens.k2, lens.right, lens.down)
 
     def of_frame(self, own: FrameLens) -> "StraightView":
         """Return the view of a frame with intrinsics of its own."""
@@ -81,7 +74,7 @@ class StraightView:
 
     @cached_property
     def _maps(self) -> tuple[np.ndarray, np.ndarray]:
-        return lens_maps(self.camera, self.seen_by, self.distortion, "polynomial")
+        return lens_maps(self.camera, self.seen_by)
 
     @cached_property
     def _nearest(self) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:

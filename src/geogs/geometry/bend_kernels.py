@@ -5,6 +5,8 @@ the usual case; ``more`` is None then, and the rest is not compiled. Else it hol
 k5, k6, and 1 for a fisheye. All are float32.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float32
 from numba import njit
@@ -12,7 +14,7 @@ from numba import njit
 from geogs.geometry.camera import LEAST_SLOPE, Camera
 from geogs.kernel_parts import inlined
 
-FAST = {
+FAST: dict[str, Any] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",

@@ -16,7 +16,7 @@ LEAST_SLOPE = 0.1
 FISHEYE_LIMIT = math.radians(88.0)
 """Angle from the axis up to which the plane z = 1 is used; rays beyond are clamped to it."""
 _CENTRAL = 1e-4
-"""Squared distance from the axis below which the slope of a fisheye's growth is that at the axis."""
+"""Squared distance from the axis below which a fisheye's growth has the slope of the axis."""
 _RADIAL_STEPS, _PLANE_STEPS = 8, 6
 """Newton steps to undistort: along the radius, and then with tangential terms in the plane."""
 

@@ -5,16 +5,13 @@ from dataclasses import replace
 
 import torch
 
-from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.loop.camera.frame_lenses import correct_frame_lenses
 from geogs.loop.camera.lens import correct_lens, found_lens
 from geogs.loop.camera.rows import correct_rows, let_lenses_move
 from geogs.loop.keyframe_matches import STAGE, KeyframeMatches
 from geogs.stopwatch import StageProgress, unwatched
-from geogs.threads import ordered_map, worker_count
 from geogs.tracking.tracker import Tracker
 from geogs.types import FrameLens, PoseCorrection
-from geogs.world.keyframes import KeyframeSet
 
 PRIORS_TOGETHER = 32
 """Keyframes whose depths are adjusted with their priors at a time; bounds memory."""
@@ -28,9 +25,9 @@ def global_bundle(
     The first pose is fixed or, in the world of a saved map, all its keyframes. Poses, inverse depth
     and information of the tracker are updated, and its graph only has the fresh edges; further
     tracking only needs those that ``FrameGraph.retire`` keeps. Returns the poses before and after;
-    scales are 1. Where it ``ends`` the tracking, images are straightened by the camera estimated
-    from the matches (:func:`~geogs.loop.global_bundle.adjust_camera`). A tracker without a map,
-    or with straightened images, is not changed.
+    scales are 1. Where it ``ends`` the tracking, the map's images are straightened by the camera
+    estimated from the matches (:func:`~geogs.loop.global_bundle.adjust_camera`). A tracker without
+    a map, or with an estimated camera, is not changed.
     """
     store = tracker.keyframes
     ids = tracker.segment.ids
@@ -66,7 +63,7 @@ def adjust_camera(matches: KeyframeMatches, ends: bool) -> None:
     readout = correct_rows(matches, finds_readout=fine)
     lens = correct_lens(matches, ends, readout=readout)
     if not ends:
-        matches.graph.see_by(table.camera)
+        matches.graph.see_by(table.assumed)
         return
     own = correct_frame_lenses(matches)
     if lens or own or (is_open and fine):
@@ -78,30 +75,9 @@ def adjust_camera(matches: KeyframeMatches, ends: bool) -> None:
     if lens:
         lens = correct_lens(matches, ends, before=lens) or lens
     if lens or own:
-        found = found_lens(table.camera, matches.camera, lens)
+        found = found_lens(table.assumed, matches.camera, lens)
         sizes = torch.tensor([o.sizes for o in own.each.values()] or [FrameLens().sizes])
         focal, right, down = sizes.double().square().mean(0).sqrt().tolist()
         found = replace(found, varies_focal=focal, varies_centre=math.hypot(right, down))
-        straighten(matches.keyframes, FrameViews(StraightView(table.camera, found), own.each))
-
-
-def straighten(keyframes: KeyframeSet, views: FrameViews) -> None:
-    """Straighten the images of keyframes to the table's pinhole.
-
-    A prior's normals and a sensor's depths are resampled, too. Matches still belong to the images
-    as tracked.
-    """
-    table = keyframes.table
-    ids = keyframes.ids
-    arrays = table.arrays
-    view = {k.id: views.of(k.frame_index) for k in keyframes}
-    images = ordered_map(lambda id: view[id].image(keyframes[id].image), ids, worker_count())
-    for id, image in zip(ids, images, strict=True):
-        arrays.put("image", id, image, recent=True)
-        arrays.recent("encoded").drop(id)
-        for name in ("prior normal", "sensor depth"):
-            if (seen := arrays.get(name, id)) is not None:
-                arrays.put(name, id, view[id].nearest(seen))
-    table.lens = views.view.lens
-    own = {k.id: views.own.get(k.frame_index) for k in keyframes}
-    table.frame_lenses = {id: lens for id, lens in own.items() if lens is not None}
+        frame = {k.id: k.frame_index for k in matches.keyframes}
+        table.straighten(found, {k: own.each[n] for k, n in frame.items() if n in own.each})

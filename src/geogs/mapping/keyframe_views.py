@@ -74,7 +74,9 @@ class MapView:
     def bare_segments(self) -> Int32[np.ndarray, "sh sw"]:
         """Numbers of the bare parts of its image."""
         arrays = self.arrays.table.arrays
-        return arrays.made("bare segments", self.id, lambda: bare_segments(self.keyframe.image))
+        return arrays.made(
+            "bare segments", self.id, lambda: bare_segments(self.keyframe.straight_image)
+        )
 
     @property
     def photo(self) -> PhotoView:

@@ -276,10 +276,9 @@ class Mapper:
         archive = Archive()
         stored = []
         rules = SurfaceRules.of(self.config)
-        images = self.keyframes.arrays.pieces.get("image", {})
         for view in self._mapped(of):
             render = rendered_keyframe(view, parameters, rules)
-            stored.append(stored_render(render, images[view.id], archive))
+            stored.append(stored_render(render, self.keyframes.reader(view.id), archive))
         return OnDemand(stored, lambda load: load())
 
     def renderer(self, frame: MapFrame = WORLD) -> MapRenderer:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import MappingConfig
@@ -22,7 +22,7 @@ from geogs.mapping.map_frame import MapFrame
 from geogs.short_repr import ShortRepr
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, RenderedKeyframe
-from geogs.world.archive import Archive, Archived
+from geogs.world.archive import Archive
 from geogs.world.disks import DiskParameters
 
 _RADIUS = 3
@@ -183,9 +183,9 @@ def _keyframe(view: MapView, maps: SurfaceMaps) -> RenderedKeyframe:
 
 
 def stored_render(
-    render: RenderedKeyframe, image: Archived, archive: Archive
+    render: RenderedKeyframe, image: Callable[[], UInt8[np.ndarray, "h w 3"]], archive: Archive
 ) -> Callable[[], RenderedKeyframe]:
-    """Put a rendering into an archive; returns what reads it, and its image, into memory.
+    """Put a rendering into an archive; returns what reads it into memory, with its ``image``.
 
     Normals are stored in half precision.
 
@@ -200,6 +200,6 @@ def stored_render(
 
     def load() -> RenderedKeyframe:
         loaded = (torch.from_numpy(values.load()).to(device).float() for values in stored)
-        return keyframe(*loaded, image=image.load())
+        return keyframe(*loaded, image=image())
 
     return load

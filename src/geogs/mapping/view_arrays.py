@@ -188,7 +188,7 @@ class ViewArrays:
         loss = self.loss
         keyframe = self.keyframes[id]
         row = self.table.views[id]
-        image = keyframe.image
+        image = keyframe.straight_image
         photo = PhotoView.prepare(
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
         )

@@ -3,7 +3,7 @@
 import copy
 import functools
 from bisect import insort
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, cast
 
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from torch import Tensor
 
+from geogs.camera.field_of_view import straight_camera
 from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config.setting import Range
 from geogs.errors import InputError
@@ -34,6 +35,8 @@ KEYFRAME_ARRAYS = {
 }
 """Large arrays of a keyframe, all optional."""
 
+STRAIGHT = "straight image"
+"""Name of the images in the pinhole of the map, which are computed from those as tracked."""
 KNOWN = 0.3
 """Relative deviation up to which a depth is used to locate a camera."""
 RELATIVE_FLOOR = 0.004
@@ -87,10 +90,21 @@ class Keyframe:
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB at working resolution; not to be changed in place."""
+        """RGB at working resolution, as it was tracked; not to be changed in place."""
         image = self.table.arrays.get("image", self.id, recent=True)
         assert image is not None, f"keyframe {self.id} has no image"
         return image
+
+    @property
+    def straight_image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The image in the pinhole of the map; not to be changed in place."""
+        view = self.table.view_of(self.id)
+        if view is None:
+            return self.image
+        straight: UInt8[np.ndarray, "h w 3"] = self.table.arrays.made(
+            STRAIGHT, self.id, lambda: view.image(self.image)
+        )
+        return straight
 
     @property
     def encoded(self) -> Any:
@@ -102,9 +116,9 @@ class Keyframe:
 
     @property
     def prior_normal(self) -> Float[Tensor, "h w 3"] | None:
-        """Unit normals of a monocular prior at working resolution, in the camera frame and facing
+        """Unit normals of a monocular prior for the straight image, in the camera frame and facing
         the camera; zero where unknown, None without a prior."""
-        normal = self.table.arrays.get("prior normal", self.id)
+        normal = self._straight_array("prior normal")
         return None if normal is None else torch.from_numpy(normal)
 
     @prior_normal.setter
@@ -113,14 +127,20 @@ class Keyframe:
 
     @property
     def sensor_depth(self) -> Float32[np.ndarray, "h w"] | None:
-        """Sensor depth in metres at working resolution, 0 where unknown; None without."""
-        depth = self.table.arrays.get("sensor depth", self.id)
+        """Sensor depth in metres for the straight image, 0 where unknown; None without."""
+        depth = self._straight_array("sensor depth")
         return None if depth is None else depth.astype(np.float32)
 
     @sensor_depth.setter
     def sensor_depth(self, metres: Float32[np.ndarray, "h w"]) -> None:
         # Half precision rounds by 0.05 %, a tenth of a sensor's error.
         self.table.arrays.put("sensor depth", self.id, metres.astype(np.float16))
+
+    def _straight_array(self, name: str) -> np.ndarray | None:
+        """Return a large array by the nearest pixels of the straight image."""
+        found = self.table.arrays.get(name, self.id)
+        view = self.table.view_of(self.id)
+        return found if found is None or view is None else view.nearest(found)
 
     def copied_to(self, table: "KeyframeTable") -> "Keyframe":
         """Copy it for another table, without the pose."""
@@ -212,15 +232,16 @@ class KeyframeTable:
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     lens: FoundLens | None = None
-    """Lens by which images were straightened at the end; None where they were not. Matches and
-    depths of cells always belong to the images as tracked."""
+    """What was found of the lens at the end, beyond the assumed camera; None where nothing was.
+    Images, matches and depths of cells always belong to the images as tracked."""
     frame_lenses: dict[Id, FrameLens] = field(default_factory=dict)
     """Per-keyframe intrinsics relative to that lens, if any."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
     """Grid of matches and depths, with the camera that saw them."""
+    assumed: Camera = field(init=False, repr=False, metadata=NOT_STORED)
+    """Camera of the images as it was assumed; the grid has it as it is estimated."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
-    """Pinhole of the images, once straightened. It differs from the grid's camera where a lens was
-    estimated."""
+    """Pinhole of the map and of straight images."""
     focal_deviation: float = field(default=0.0, init=False, repr=False, metadata=NOT_STORED)
     """Relative standard deviation of a focal length that was not given, before it is estimated from
     all matches."""
@@ -244,15 +265,18 @@ class KeyframeTable:
         encode: Encode | None = None,
         resident: int = RESIDENT,
         focal_deviation: float = 0.0,
+        pinhole: Camera | None = None,
     ) -> "KeyframeTable":
         """Set what is not stored: the grid of depths, the image encoder, how many large arrays of
-        a name stay in memory, and the prior deviation of the focal length. Return the table."""
+        a name stay in memory, the prior deviation of the focal length, and the pinhole of the map
+        (default: :func:`~geogs.camera.field_of_view.straight_camera`). Return the table."""
         self.grid = grid
-        self.camera = grid.camera
+        self.assumed = grid.camera
+        self.camera = pinhole or straight_camera(grid.camera)
         self.encode = encode
         self.set_of = {}
         if self.lens is not None:
-            self.see_by(StraightView(self.camera, self.lens).seen_by)
+            self.see_by(_view(self.camera, self.assumed, self.lens).seen_by)
         self.focal_deviation = focal_deviation
         self.arrays.resident = resident
         for keyframe in self.keyframes.values():
@@ -264,15 +288,34 @@ class KeyframeTable:
         self.grid = SampleGrid(camera, self.grid.device)
 
     def view_of(self, id: int) -> StraightView | None:
-        """Return how the image of a keyframe was straightened; None where it was not."""
-        if self.lens is None:
+        """Return how the image of a keyframe is straightened; None where it is straight."""
+        view = self.view
+        return None if view is None else FrameViews(view, self.frame_lenses).of(id)
+
+    @property
+    def view(self) -> StraightView | None:
+        """How images are straightened by the shared lens; None where they are straight."""
+        if self.lens is None and self.assumed == self.camera:
             return None
-        return FrameViews(_view(self.camera, self.lens), self.frame_lenses).of(id)
+        return _view(self.camera, self.assumed, self.lens or FoundLens())
+
+    def reader(self, id: int) -> Callable[[], UInt8[np.ndarray, "h w 3"]]:
+        """Return what reads the straight image of a keyframe, as it is now, from the file."""
+        stored = self.arrays.pieces["image"][id]
+        view = self.view_of(id)
+        return stored.load if view is None else lambda: view.image(stored.load())
+
+    def straighten(self, lens: FoundLens, own: Mapping[int, FrameLens]) -> None:
+        """Straighten images by what was found of the lens, and of that of each keyframe, by id."""
+        self.lens = lens
+        self.frame_lenses = dict(own)
+        self.arrays.recent(STRAIGHT).clear()
 
     def mirror(self) -> "KeyframeTable":
         """Return an empty table that shares the large arrays of this one."""
         twin = KeyframeTable(arrays=self.arrays, lens=self.lens, frame_lenses=self.frame_lenses)
         twin.grid = self.grid
+        twin.assumed = self.assumed
         twin.camera = self.camera
         twin.encode = self.encode
         twin.set_of = {}
@@ -335,7 +378,7 @@ class KeyframeSet:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the images."""
+        """Pinhole of the map."""
         return self.table.camera
 
     @property
@@ -454,9 +497,9 @@ class KeyframeSet:
 
 
 @functools.lru_cache(maxsize=1)
-def _view(camera: Camera, lens: FoundLens) -> StraightView:
+def _view(camera: Camera, assumed: Camera, lens: FoundLens) -> StraightView:
     """Return one cached view for all keyframes."""
-    return StraightView(camera, lens)
+    return StraightView(camera, assumed, lens)
 
 
 def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:

@@ -65,6 +65,11 @@ class LruCache(Generic[K, V]):
         with self._lock:
             self._values.pop(key, None)
 
+    def clear(self) -> None:
+        """Remove all values without calling ``leave``."""
+        with self._lock:
+            self._values.clear()
+
     def _make_room(self, wanted: Collection[K]) -> None:
         with self._lock:
             going = (k for k in list(self._values) if k not in wanted)

@@ -103,7 +103,7 @@ def track_to_folder(settings: RunSettings, output: Path) -> None:
         open_source(settings.source, settings.config.input), settings.config, device
     )
     folder = prepare_output_folder(output)
-    slam = Slam(source.camera, settings.config, str(device))
+    slam = Slam(source.image_camera, settings.config, str(device), pinhole=source.camera)
     start = time.perf_counter()
     frames = 0
     for frame in source:
@@ -152,7 +152,8 @@ def correct_saved_map(settings: RunSettings, output: Path, progress: RunProgress
     source = saved.calibrated(open_source(settings.source, settings.config.input))
     device = require_device(settings.device)
     with saved.world(device) as world:
-        slam = Slam(source.camera, settings.config, str(device), world=world)
+        cameras = source.image_camera, source.camera
+        slam = Slam(cameras[0], settings.config, str(device), world=world, pinhole=cameras[1])
     slam.adjust(progress.stage)
     write_results(output, Result(slam, source, False, progress), keyframe_images=False)
 
@@ -172,7 +173,8 @@ def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> Sa
     config = settings.config
     device = require_device(settings.device)
     source = self_calibrated(open_source(settings.source, config.input), config, device)
-    slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
+    prior = open_prior(config.prior, source.camera, device)
+    slam = Slam(source.image_camera, config, str(device), prior, pinhole=source.camera)
     metadata = RunMetadata(
         settings, device.type, source.fingerprint(), source.calibration, shutter=source.shutter
     )

@@ -12,7 +12,6 @@ import geogs
 from geogs.application.export.export import export, exports_of
 from geogs.application.result_settings import ExportSettings
 from geogs.application.results.write import write_config
-from geogs.camera.distortion import undistorted_rays
 from geogs.camera.shutter.shutter import Shutter
 from geogs.cli.main import main
 from geogs.config import Config
@@ -21,6 +20,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_posed_source, open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
+from lenses import undistorted_rays
 from saved_results import CAMERA, IDS, MASKED, make_result
 
 LENSES = {

@@ -88,7 +88,7 @@ def test_no_ground_is_told():
 
 
 def pixel_of(T_cw: np.ndarray, X: np.ndarray, calibration: Calibration) -> tuple[float, float]:
-    from geogs.camera.distortion import distorted_pixels
+    from lenses import distorted_pixels
 
     seen = T_cw[:3, :3] @ X + T_cw[:3, 3]
     rays = (seen[:2] / seen[2])[None]

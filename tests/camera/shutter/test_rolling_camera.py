@@ -8,6 +8,7 @@ import pytest
 from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.geometry.camera import Camera
 from geogs.io.sources.formats.video_file import turn_upright
+from lenses import with_lens
 
 LANDSCAPE = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 PORTRAIT = Camera(50.0, 50.0, 23.5, 31.5, 48, 64)
@@ -41,10 +42,10 @@ def test_a_smaller_image_keeps_the_times_of_the_sensors_lines():
 
 
 def test_rays_are_the_inverse_of_pixels():
-    rolling = RollingCamera(LANDSCAPE, (-0.2, 0.05, 0.001, 0.0))
+    rolling = RollingCamera(with_lens(LANDSCAPE, (-0.2, 0.05, 0.001, 0.0)))
     pixels = np.array([[0.0, 0.0], [63.0, 47.0], [20.0, 40.0]])
     rays = rolling.rays(pixels)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(rolling.pixels(3 * rays), pixels, atol=1e-6)
-    pinhole = replace(rolling, distortion=())
+    pinhole = replace(rolling, camera=LANDSCAPE)
     np.testing.assert_allclose(pinhole.pixels(pinhole.rays(pixels)), pixels, atol=1e-9)

@@ -10,6 +10,7 @@ from geogs.camera.shutter.rows import RowOffsets
 from geogs.camera.shutter.shutter import Shutter
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
+from lenses import with_lens
 
 CAMERA = Camera(420.0, 415.0, 255.0, 190.0, 512, 384)
 FAST = AngularMotion(np.array([1.2, -1.5, 0.8]), np.array([10.0, -12.0, 8.0]))
@@ -36,7 +37,7 @@ def dense(offsets: RowOffsets, motion: AngularMotion, readout: float = READOUT) 
 @pytest.mark.parametrize("distortion", [(), (-0.28, 0.08, 0.001, -0.002)])
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
 def test_offsets_at_pixels_are_those_of_single_rays(distortion, quarter_turns):
-    rolling = RollingCamera(CAMERA, distortion, quarter_turns)
+    rolling = RollingCamera(with_lens(CAMERA, distortion), quarter_turns)
     zoom = 1.15 if distortion else 1.0
     target = Camera(420.0 * zoom, 415.0 * zoom, 255.0, 190.0, 512, 384)
     offsets = dense(RowOffsets(rolling, target), FAST)
@@ -49,7 +50,7 @@ def test_offsets_at_pixels_are_those_of_single_rays(distortion, quarter_turns):
 
 
 def test_a_camera_that_stands_or_reads_at_once_has_no_offsets():
-    offsets = RowOffsets(RollingCamera(CAMERA, (-0.2, 0.05, 0.0, 0.0)), CAMERA)
+    offsets = RowOffsets(RollingCamera(with_lens(CAMERA, (-0.2, 0.05, 0.0, 0.0))), CAMERA)
     assert not dense(offsets, AngularMotion()).any()
     assert not dense(offsets, FAST, 0.0).any()
 
@@ -85,7 +86,7 @@ def test_parallax_counts_little_where_the_rate_changes_fast():
 
 @pytest.mark.parametrize("distortion", [(), (-0.28, 0.08, 0.001, -0.002)])
 def test_what_is_kept_of_the_rows_says_where_and_when_each_node_was_seen(distortion):
-    rolling, zoom = RollingCamera(CAMERA, distortion), 1.15
+    rolling, zoom = RollingCamera(with_lens(CAMERA, distortion)), 1.15
     target = Camera(420.0 * zoom, 415.0 * zoom, 255.0, 190.0, 512, 384)
     offsets = RowOffsets(rolling, target)
     rows = offsets.seen(offsets.nodes(FAST, READOUT), Shutter(READOUT, error=0.003))

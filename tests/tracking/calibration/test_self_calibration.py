@@ -19,6 +19,7 @@ from geogs.tracking.calibration.growing_bundle import GrowingBundle
 from geogs.tracking.calibration.self_calibration import LEAST_DEVIATION, _row_times, self_calibrate
 from geogs.tracking.calibration.unknowns import Unknowns
 from geogs.types import Frame
+from lenses import with_lens
 from tracking_scenes import CAMERA, frames, pose, render
 
 pytestmark = pytest.mark.system
@@ -131,7 +132,7 @@ def test_times_of_rows_are_those_of_the_image_as_it_came():
     first, last = turned.of(torch.tensor([[0.0, 0.0], [CAMERA.width - 1.0, 0.0]])).tolist()
     assert (first, last) == (pytest.approx(0.5), pytest.approx(-0.5))
     assert turned.per_row == pytest.approx(0.0, abs=1e-9)
-    barrel = RollingCamera(CAMERA, (-0.2, 0.05, 0.0, 0.0))
+    barrel = RollingCamera(with_lens(CAMERA, (-0.2, 0.05, 0.0, 0.0)))
     small = CAMERA.with_long_edge(CAMERA.long_edge // 2)
     times = _row_times(barrel, small)
     pixels = torch.rand(200, 2) * torch.tensor([small.width - 1.0, small.height - 1.0])

@@ -14,6 +14,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frames.row_errors import LONGEST_INTERVAL, RowErrors, lagrange
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
+from lenses import with_lens
 
 CAMERA = Camera(220.0, 215.0, 157.0, 121.0, 320, 240)
 GRID = SampleGrid(CAMERA)
@@ -36,7 +37,7 @@ def trajectory(interval: float = 1 / RATE) -> Trajectory:
 
 
 def rows(distortion: tuple[float, ...] = ()) -> tuple[RollingCamera, RowOffsets, SeenRows]:
-    rolling = RollingCamera(CAMERA, distortion)
+    rolling = RollingCamera(with_lens(CAMERA, distortion))
     offsets = RowOffsets(rolling, CAMERA)
     return rolling, offsets, offsets.seen(offsets.nodes(ASSUMED, READOUT), Shutter(READOUT))
 

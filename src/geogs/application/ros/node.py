@@ -195,9 +195,10 @@ class CameraNode:
         config = self._settings.config
         calibration = found.fit(*self._size)
         self._rectifier = Rectifier(
-            calibration, config.input.long_edge, config.input.working_field_of_view
+            calibration, config.input.long_edge, config.input.working_field_of_view, keeps_lens=True
         )
-        self._slam = Slam(self._rectifier.camera, config, self._settings.device, live=True)
+        cameras = self._rectifier.image_camera, self._rectifier.camera
+        self._slam = Slam(cameras[0], config, self._settings.device, live=True, pinhole=cameras[1])
 
     def image(self, message: Any) -> None:
         """Track an image and publish its pose."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from geogs.application.progress.run_progress import RunProgress
@@ -18,7 +19,6 @@ from geogs.application.scale.measurable_scene import (
     scale_sentence,
 )
 from geogs.application.scale.tags import TagSize, scale_by_tags
-from geogs.camera.distortion import undistorted_rays
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
@@ -205,8 +205,8 @@ def _one(
             f"{len(trajectory.T_wc)} frames that was tracked."
         )
     depth = scene.surface(np.linalg.inv(trajectory.T_wc[known.frame]))
-    both = np.array([known.first, known.second])
-    rays = undistorted_rays(both, calibration.camera(), calibration.distortion, calibration.lens)
+    both = torch.tensor([known.first, known.second], dtype=torch.float64)
+    rays = calibration.camera().plane(both).numpy()
     ends, along = zip(*(_lifted(scene, depth, ray, known) for ray in rays), strict=True)
     between = ends[1] - ends[0]
     length = float(np.linalg.norm(between))

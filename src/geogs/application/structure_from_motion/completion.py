@@ -141,12 +141,8 @@ def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
 
 
 def as_seen(view: StraightView) -> Calibration:
-    """Calibration of the working images, with the distortion that was estimated since."""
-    camera = view.seen_by
-    bend = view.distortion if any(view.distortion) else ()
-    return Calibration(
-        camera.fx, camera.fy, camera.cx, camera.cy, bend, width=camera.width, height=camera.height
-    )
+    """Calibration of the working images, with what was found of it since."""
+    return Calibration.of(view.seen_by)
 
 
 def _read(video: Source, numbers: Collection[int]) -> list[Frame]:

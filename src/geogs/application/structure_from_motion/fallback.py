@@ -238,10 +238,8 @@ def impossible(settings: RunSettings, source: Source) -> str:
 def _views(slam: Slam) -> FrameViews:
     """Undistortion of a tracked video's frames by the lens of the adjustment."""
     table = slam.world.keyframes
-    camera = slam.camera
     own = {table[id].frame_index: lens for id, lens in table.frame_lenses.items()}
-    lens = slam.lens
-    return FrameViews(StraightView(camera, lens) if lens else StraightView.of_pinhole(camera), own)
+    return FrameViews(table.view or StraightView(table.camera, table.assumed), own)
 
 
 def _is_shape_known(judged: Verdict) -> bool:

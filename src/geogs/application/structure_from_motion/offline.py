@@ -111,7 +111,7 @@ class PlacedOffline(Work):
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
         lost = LostFrames(
             self.source,
-            FrameViews(StraightView.of_pinhole(self.source.camera)),
+            FrameViews(StraightView(self.source.camera, self.source.camera)),
             self.trajectory,
             placed.numbers,
             scene.keyframe_trajectory(),
@@ -142,8 +142,9 @@ class PlacedOffline(Work):
 
 
 def beginning_with(video: Source, found: Source) -> Source:
-    """A video with the estimated shutter, and focal length where none was given, as the start of
-    structure from motion, which estimates its own; see ``MIN_READOUT_FPS``, too."""
+    """A straight video with the estimated shutter, and focal length where none was given, as the
+    start of structure from motion, which estimates its own; see ``MIN_READOUT_FPS``, too."""
+    video = video.straight()
     begun = video if video.recorded_fps < MIN_READOUT_FPS else video.with_shutter(found.shutter)
     if not video.is_calibration_open:
         return begun

@@ -1,24 +1,19 @@
 """Rolling-shutter camera: its lens, and the time of each pixel."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from geogs.camera.distortion import LensModel, distorted_pixels, undistorted_rays
 from geogs.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
 class RollingCamera:
-    """Camera of upright, distorted images of any size, and the direction of its readout."""
+    """Camera of upright images of any size, with its lens, and the direction of its readout."""
 
     camera: Camera
-    """The pinhole part."""
-    distortion: tuple[float, ...] = ()
-    """OpenCV's coefficients; empty for a pinhole."""
-    lens: LensModel = field(default="polynomial", kw_only=True)
-    """Lens model of the coefficients."""
     quarter_turns: int = 0
     """Clockwise quarter turns from the sensor's images to the upright ones."""
     lines: int | None = None
@@ -40,11 +35,11 @@ class RollingCamera:
 
     def rays(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Return the viewing rays of pixels, as unit vectors."""
-        plane = undistorted_rays(pixels, self.camera, self.distortion, self.lens)
+        plane = self.camera.plane(torch.from_numpy(pixels)).numpy()
         rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def pixels(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Project vectors of any length that point forward."""
         plane = rays[:, :2] / rays[:, 2:]
-        return distorted_pixels(plane, self.camera, self.distortion, self.lens)
+        return self.camera.pixels(torch.from_numpy(plane)).numpy()

@@ -23,7 +23,7 @@ def node_count(pixels: int) -> int:
 class RowOffsets:
     """Offsets of the pixels of a rectified image in the rolling one, due to camera motion.
 
-    The rectified image is that of a pinhole with a global shutter at the time of the middle row.
+    The rectified image is that of a camera with a global shutter at the time of the middle row.
     The rolling camera sees a distant point at ray r where ``Exp(angles(t)) r`` projects through its
     lens, at the time t of the row that it projects to.
     """
@@ -36,9 +36,9 @@ class RowOffsets:
         lines = (np.arange(node_count(rectified.height)) - 1) * CELL + (CELL - 1) / 2
         self._shape = (len(lines), len(columns))
         u, v = (x.ravel() for x in np.meshgrid(columns, lines))
-        plane = [(u - rectified.cx) / rectified.fx, (v - rectified.cy) / rectified.fy]
-        self._rays = np.stack([*plane, np.ones_like(u)], axis=1)
         self._pixels = np.stack([u, v], axis=1)
+        plane = rectified.plane(torch.from_numpy(self._pixels)).numpy()
+        self._rays = np.concatenate([plane, np.ones_like(plane[:, :1])], axis=1)
         self._still = rolling.pixels(self._rays)
 
     def nodes(self, motion: AngularMotion, readout: float) -> Float[np.ndarray, "n 2"]:
@@ -95,11 +95,8 @@ class RowOffsets:
             shutter: their shutter.
         """
         pixels = self._still + nodes
-        target = self._rectified
-        rays = self._rolling.rays(pixels)
-        focal = [target.fx, target.fy]
-        centre = [target.cx, target.cy]
-        offset = rays[:, :2] / rays[:, 2:] * focal + centre - self._pixels
+        plane = self._rolling.camera.plane(torch.from_numpy(pixels))
+        offset = self._rectified.pixels(plane).numpy() - self._pixels
         seconds = shutter.readout * self._rolling.line_times(pixels)
         return SeenRows(
             torch.from_numpy(offset.reshape(*self._shape, 2)).half(),

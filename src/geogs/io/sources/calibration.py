@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 
-from geogs.camera.distortion import LensModel, with_bend
+from geogs.camera.distortion import LensModel
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.account import Account
@@ -132,9 +132,37 @@ class Calibration:
         certainty = "assumed: " if self.is_guess else ""
         return f"camera: {focal} pixels{kind} ({certainty}{self.origin})"
 
+    @staticmethod
+    def of(camera: Camera) -> "Calibration":
+        """Return the calibration of images of a camera."""
+        is_fisheye = camera.is_fisheye
+        terms = (camera.k1, camera.k2, camera.k3, camera.k4) if is_fisheye else camera.distortion
+        if not is_fisheye:
+            terms = terms[: next(n for n in (0, 4, 5, 8) if not any(terms[n:]))]
+        return Calibration(
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            terms,
+            camera.width,
+            camera.height,
+            lens="fisheye" if is_fisheye else "polynomial",
+        )
+
     def camera(self) -> Camera:
-        """The pinhole part. The size must be known."""
-        return Camera(self.fx, self.fy, self.cx, self.cy, *self._size())
+        """The camera of its images, with the distortion. The size must be known."""
+        terms = (*self.distortion, *8 * (0.0,))[:8]
+        if self.lens == "fisheye":
+            k1, k2, k3, k4, *_ = terms
+            rest = {"k1": k1, "k2": k2, "k3": k3, "k4": k4}
+        else:
+            rest = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), terms, strict=True))
+        width, height = self._size()
+        is_fisheye = self.lens == "fisheye"
+        return Camera(
+            self.fx, self.fy, self.cx, self.cy, width, height, is_fisheye=is_fisheye, **rest
+        )
 
     @property
     def numbers(self) -> str:
@@ -144,13 +172,11 @@ class Calibration:
         return ",".join(name + [f"{value:.6g}" for value in values])
 
     def with_lens(self, found: FoundLens) -> "Calibration":
-        """Return the calibration with the distortion added that was found in images undistorted by
-        it. The size must be known."""
-        bend = (found.k1, found.k2)
-        shift = (found.right, found.down)
-        camera, distortion = with_bend(
-            self.camera(), self.distortion, self.lens, bend, found.focal, shift
-        )
+        """Return the calibration with the change that was found of its lens. The size must be
+        known."""
+        change = math.log(found.focal), found.k1, found.k2, found.right, found.down
+        camera = self.camera().moved(*change)
+        distortion = Calibration.of(camera).distortion
         origin = f"{self.origin}; distortion refined: k1 {found.k1:.4f}, k2 {found.k2:.4f}"
         if found.is_off_centre:
             off = camera.cx - self.cx, camera.cy - self.cy

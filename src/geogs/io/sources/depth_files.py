@@ -7,9 +7,9 @@ from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, Float32
 
-from geogs.camera.distortion import distorted_pixels
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import decoded
 from geogs.io.sources.calibration import Calibration
@@ -170,7 +170,7 @@ def registered(
     z = z + tz
     seen = colour.camera()
     z = np.where(z > 0, z, np.inf)
-    pixels = distorted_pixels(np.stack([x / z, y / z], 1), seen, colour.distortion, colour.lens)
+    pixels = seen.pixels(torch.from_numpy(np.stack([x / z, y / z], 1))).numpy()
     u, v = np.rint(pixels).T
     inside = (u >= 0) & (u < seen.width) & (v >= 0) & (v < seen.height) & np.isfinite(z)
     order = np.argsort(-z[inside], kind="stable")  # the last value written stays

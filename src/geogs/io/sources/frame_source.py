@@ -107,9 +107,9 @@ class ReadingPlace:
 class Source:
     """Frames of the recordings one after the other, numbered and timed through.
 
-    They are at working resolution, undistorted, in time order, all of one pinhole camera,
-    and can be iterated over repeatedly. No motion links the first frame of a recording to the last
-    of the one before.
+    They are at working resolution, with their lens, in time order, all of one camera, and can be
+    iterated over repeatedly. No motion links the first frame of a recording to the last of the one
+    before.
     """
 
     def __init__(self, recordings: Sequence[WorkingImages]) -> None:
@@ -126,7 +126,9 @@ class Source:
         self.kind = first.reader.info.kind
         """The format of the first: video, images, bag, replica, tum or 7scenes."""
         self.camera = first.camera
-        """The pinhole camera of every frame."""
+        """The pinhole of straight frames, of the frames' size."""
+        self.image_camera = first.image_camera
+        """The camera of every frame, with its lens unless they are :meth:`straight`."""
         self.calibration = first.calibration
         """The camera of the first recording's images as stored, upright, with its distortion."""
         self.shutter = first.shutter
@@ -203,7 +205,7 @@ class Source:
         return self.calibration.origin
 
     def with_calibration(self, calibration: Calibration) -> "Source":
-        """The same frames, undistorted by another calibration of the stored images."""
+        """The same frames by another calibration of the stored images."""
         return Source([images.known_better(calibration) for images in self._recordings])
 
     def with_lens(self, found: FoundLens) -> "Source":
@@ -215,6 +217,10 @@ class Source:
     def with_shutter(self, shutter: Shutter) -> "Source":
         """The same frames, with their rows rectified by another readout."""
         return Source([images.known_better(shutter=shutter) for images in self._recordings])
+
+    def straight(self) -> "Source":
+        """The same frames, undistorted."""
+        return Source([images.known_better(keeps_lens=False) for images in self._recordings])
 
     def with_focal(self, focal: float) -> "Source":
         """The same frames, rendered for a pinhole of that focal length."""
@@ -237,7 +243,7 @@ class Source:
         return self._recordings[0].rolling_camera
 
     def as_recorded(self) -> Generator[Frame, None, None]:
-        """All frames of the first recording, at stride 1, without row rectification."""
+        """All frames of the first recording, at stride 1, straight, without row rectification."""
         return iter(Source([self._recordings[0].as_recorded()]))
 
     def fingerprint(self) -> str:

@@ -56,7 +56,7 @@ MOST_OF = 0.97
 
 
 class WorkingImages:
-    """Images of a recording at working resolution, undistorted, in time order.
+    """Images of a recording at working resolution, with their lens, in time order.
 
     The rows of a rolling shutter, where its readout is known, are rectified to the middle one.
     """
@@ -71,12 +71,14 @@ class WorkingImages:
         overlay: Bool[np.ndarray, "h w"] | None = None,
         poses: ChosenPoses | None = None,
         depth: ChosenDepth | None = None,
+        keeps_lens: bool = True,
     ) -> None:
         """``calibration`` of the upright images, instead of the reader's.
 
         ``shutter``, instead of the settings'; ``focal`` of the working images, instead of the
         settings'; ``overlay``, true where all images at working size show a static overlay;
-        ``poses`` by the clock of the images, and ``depth``, instead of the settings'.
+        ``poses`` by the clock of the images, and ``depth``, instead of the settings'. Without
+        ``keeps_lens`` images are made straight.
         """
         info = reader.info
         self._selection = selection_of(config, info.fps)
@@ -110,15 +112,23 @@ class WorkingImages:
         valid = None if overlay is None else ~overlay
         if masks is not None and self._masks is None:
             valid = read_mask(masks, (info.height, info.width))
+        self._keeps_lens = keeps_lens and focal is None
         rectify = partial(
-            Rectifier, self.calibration, config.long_edge, config.working_field_of_view, focal
+            Rectifier,
+            self.calibration,
+            config.long_edge,
+            config.working_field_of_view,
+            focal,
+            keeps_lens=self._keeps_lens,
         )
         self._rectifier = rectify()
         if valid is not None:
             window = window_around(mask_as_image(self._rectifier, valid))
-            self._rectifier = self._rectifier if window is None else rectify(window)
+            self._rectifier = self._rectifier if window is None else rectify(window=window)
         self.camera = self._rectifier.camera
-        """The pinhole camera of the working images: of the part that holds all valid pixels."""
+        """The pinhole of straight images: of the part that holds all valid pixels."""
+        self.image_camera = self._rectifier.image_camera
+        """The camera of the working images, with its lens unless they are straight."""
         check_large_enough(self.camera, info.name)
         self.mask: Bool[np.ndarray, "h w"] | None = (
             None if valid is None else mask_as_image(self._rectifier, valid)
@@ -197,9 +207,11 @@ class WorkingImages:
         focal: float | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
         stride: int | None = None,
+        keeps_lens: bool | None = None,
     ) -> "WorkingImages":
         """The same images with another calibration, another readout, another focal length of the
-        working camera, a static overlay masked out, or at another stride."""
+        working camera, a static overlay masked out, at another stride, or with or without their
+        lens."""
         info = self.reader.info
         return WorkingImages(
             self.reader,
@@ -210,11 +222,12 @@ class WorkingImages:
             self._overlay if overlay is None else overlay,
             self.poses,
             self.depth,
+            self._keeps_lens if keeps_lens is None else keeps_lens,
         )
 
     def as_recorded(self) -> "WorkingImages":
-        """All images of the selection at stride 1, without row rectification."""
-        return self.known_better(shutter=Shutter(), stride=1)
+        """All images of the selection at stride 1, straight, without row rectification."""
+        return self.known_better(shutter=Shutter(), stride=1, keeps_lens=False)
 
     def spread(self, count: int) -> Iterator[RawFrame]:
         """Read ``count`` images spread over the selection, at working size, lens and rows as
@@ -307,7 +320,7 @@ class WorkingImages:
         error = self.shutter.error
         if error == 0:
             return None
-        offsets = RowOffsets(self.rolling_camera, self.camera)
+        offsets = RowOffsets(self.rolling_camera, self.image_camera)
         still = offsets.nodes(AngularMotion(), 0.0)
         seen = offsets.seen(still, Shutter(error, error=error))
         return replace(seen, is_rectified=False)
@@ -348,7 +361,7 @@ class WorkingImages:
             return 0 <= after < end and after % chosen.stride == 0
 
         images = map(self._at_working_size, self.reader.read(start - before, stop, 1))
-        offsets = RowOffsets(rolling, self.camera)
+        offsets = RowOffsets(rolling, self.image_camera)
 
         def straight(seen: tuple[RawFrame, AngularMotion]) -> RawFrame:
             raw, turning = seen

@@ -1,7 +1,8 @@
 """Shared intrinsics in the adjustment of all keyframes: k1, k2, focal length, principal point.
 
-Images were undistorted by the given or estimated lens. The remaining distortion is small, and all
-matches of the video together determine it; a straight walk drifts in scale until it is corrected.
+Matches are those of images as they came, seen by the given or estimated lens. Its remaining error
+is small, and all matches of the video together determine it; a straight walk drifts in scale until
+it is corrected.
 The grid gets the estimated camera and everything is adjusted again; matches do not change. The
 focal length is corrected with it where matches require that: one estimated for a pinhole is off by
 several percent (docs/notebook/lens.md).
@@ -144,7 +145,7 @@ class _LensSearch:
     @property
     def _moves(self) -> tuple[float, ...]:
         """Changes of the camera relative to the given one."""
-        return self._matches.camera.moves_from(self._table.camera)
+        return self._matches.camera.moves_from(self._table.assumed)
 
     def _chosen(self, evidence: LensEvidence) -> LensEstimate:
         """Return the estimate of the free parameters, with their priors."""
@@ -169,7 +170,7 @@ class _LensSearch:
         if said.of(slice(RADIAL, SHAPES))._replace(size=found).evidence < CENTRE_EVIDENCE:
             self._frees_centre = False
             self.left = ROUNDS
-            given = self._table.camera
+            given = self._table.assumed
             self._matches.graph.see_by(replace(self._matches.camera, cx=given.cx, cy=given.cy))
 
     def _shifts(self, rows: RowErrors, part: list[Pair]) -> Float[Tensor, "e p 2"]:
@@ -195,7 +196,7 @@ class _LensSearch:
         said = FoundLens(
             0.0, 0.0, k1, k2, 1.0, open_focal, deviation_centre=max(of_centre, default=0.0)
         )
-        return found_lens(self._table.camera, self._matches.camera, said)
+        return found_lens(self._table.assumed, self._matches.camera, said)
 
 
 def _contradict_focal(said: LensEstimate) -> bool:
@@ -206,8 +207,8 @@ def _contradict_focal(said: LensEstimate) -> bool:
 
 
 def found_lens(given: Camera, found: Camera, said: FoundLens | None = None) -> FoundLens:
-    """Return the lens of an estimated camera relative to the ``given`` pinhole; deviations are
-    those in ``said``."""
+    """Return the lens of an estimated camera relative to the ``given`` one; deviations are those in
+    ``said``."""
     focal, k1, k2, right, down = found.moves_from(given)
-    said = said or FoundLens(0.0, 0.0, 0.0, 0.0)
+    said = said or FoundLens()
     return replace(said, k1=k1, k2=k2, focal=math.exp(focal), right=right, down=down)

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geogs.camera.distortion import distorted_pixels
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.formats import realitycapture
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.sniff import _posed_set, open_posed_source
 from io_samples import write_image
+from lenses import distorted_pixels
 from posed_layouts import Room, render_room
 from view_lists import (
     CX,

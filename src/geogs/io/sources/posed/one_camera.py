@@ -116,8 +116,6 @@ class Resampler:
         self.size = (resized.width, resized.height)
         """Width and height to which images are resized before they are resampled."""
         self._resized = resized
-        self._distortion = source.distortion
-        self._lens = source.lens
         self._target = target
         self._keeps_maps = keeps_maps
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
@@ -138,7 +136,7 @@ class Resampler:
         """Column and row in the resized source of each pixel of the target."""
         if self._kept is not None:
             return self._kept
-        maps = lens_maps(self._target, self._resized, self._distortion, self._lens)
+        maps = lens_maps(self._target, self._resized)
         if self._keeps_maps:
             self._kept = maps
         return maps
