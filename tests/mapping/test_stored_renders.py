@@ -52,7 +52,7 @@ def stored(
             counts.append(len(held))
         return render
 
-    return OnDemand([stored_render(r, archive.put(r.image), archive) for r in renders], loaded)
+    return OnDemand([stored_render(r, archive.put(r.image).load, archive) for r in renders], loaded)
 
 
 def test_elements_are_made_when_they_are_asked_for():

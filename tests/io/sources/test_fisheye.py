@@ -132,8 +132,10 @@ def test_fisheye_and_rows_are_undone_at_once(tmp_path):
     intrinsics = "fisheye,150,150,95.5,71.5," + ",".join(map(str, K))
     both = open_source(
         tmp_path, InputConfig(intrinsics, working_field_of_view=60.0, readout=READOUT)
-    )
-    lens = open_source(tmp_path, InputConfig(intrinsics, working_field_of_view=60.0, readout=0.0))
+    ).straight()
+    lens = open_source(
+        tmp_path, InputConfig(intrinsics, working_field_of_view=60.0, readout=0.0)
+    ).straight()
     true = global_image(hand_held, 1 / RATE, both.camera).astype(float)
     inner = np.s_[12:-12, 12:-12]
     errors = [np.abs(list(s)[1].image - true)[inner].mean() for s in (both, lens)]
