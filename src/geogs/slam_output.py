@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 from torch import Tensor
 
 from geogs.config import Config
@@ -57,6 +57,11 @@ class SlamOutput:
     def camera(self) -> Camera:
         """Pinhole of the map and of straight images."""
         return self.world.keyframes.camera
+
+    def straightened(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """Return an image of the camera in the pinhole of the map."""
+        view = self.world.keyframes.view
+        return image if view is None else view.image(image)
 
     @property
     def frames(self) -> int:

@@ -30,6 +30,7 @@ from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs.world.segments import TrackState
+from lenses import LENSES
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
 from tracking_scenes import frames
@@ -53,10 +54,10 @@ def camera_for(device: torch.device) -> Camera:
     return LARGE if device.type == "cuda" else SMALL
 
 
-@pytest.fixture(params=[(0.0, 0.0), (0.08, -0.1)], ids=["pinhole", "lens"])
+@pytest.fixture(params=LENSES)
 def camera(device, request) -> Camera:
-    """One that bends, too."""
-    return camera_for(device).moved(0.0, *request.param)
+    """One of each model."""
+    return replace(camera_for(device), **LENSES[request.param])
 
 
 def scene(camera: Camera, frames: int = 4, reach: int = 9, seed: int = 0) -> BundleProblem:

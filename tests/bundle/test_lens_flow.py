@@ -12,6 +12,7 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.geometry.camera import Camera
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
+from lenses import LENSES
 from oracles import lens_reference
 from oracles.pinhole_flow import PinholeFlow
 
@@ -35,10 +36,10 @@ def close(found: torch.Tensor, wanted: torch.Tensor) -> bool:
     return float((found - wanted).norm() / wanted.norm()) < 2e-5
 
 
-@pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
+@pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("shared", ["lens", "lens and more", "more", "nothing"])
-def test_equations_are_those_of_plain_pytorch(distortion, shared):
-    lens = CAMERA.moved(0.0, *distortion)
+def test_equations_are_those_of_plain_pytorch(name, shared):
+    lens = replace(CAMERA, **LENSES[name])
     problem, block = problem_of(lens), LensBlock(lens, GRID.pixels)
     g = torch.Generator().manual_seed(2)
     e, *cells = problem.pixels.shape

@@ -10,6 +10,7 @@ import torch
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from lenses import LENSES
 
 F64 = torch.float64
 CAMERA = Camera(fx=300.0, fy=310.0, cx=151.3, cy=117.9, width=320, height=240)
@@ -50,14 +51,14 @@ def test_resizing_there_and_back_is_exact():
         assert getattr(there, name) == pytest.approx(getattr(CAMERA, name), rel=1e-14)
 
 
-@pytest.mark.parametrize("bend", [(0.0, 0.0), (0.1, -0.2), (-0.25, 0.06)])
-def test_pixels_and_points_of_a_camera_that_bends_are_opencv_s(bend):
-    camera = replace(CAMERA, k1=bend[0], k2=bend[1])
+@pytest.mark.parametrize("name", LENSES)
+def test_pixels_and_points_of_a_camera_that_bends_are_opencv_s(name):
+    camera = replace(CAMERA, **LENSES[name])
     pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)).double()
     pixels = pixels * torch.tensor([camera.width - 1.0, camera.height - 1.0])
     plane = camera.plane(pixels)
     points = np.c_[plane.numpy(), np.ones(50)]
-    wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, (*bend, 0.0, 0.0))
+    wanted = opencv_pixels(camera, points)
     np.testing.assert_allclose(wanted[:, 0], pixels, atol=1e-6)
     np.testing.assert_allclose(camera.pixels(plane), pixels, atol=1e-6)
     shown, z = camera.project(2 * torch.from_numpy(points))
@@ -68,6 +69,39 @@ def test_pixels_and_points_of_a_camera_that_bends_are_opencv_s(bend):
     xx, xy, yy = camera.bend_jacobian(plane)
     torch.testing.assert_close(torch.stack([xx, xy], -1), numeric[0], atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(torch.stack([xy, yy], -1), numeric[1], atol=1e-6, rtol=1e-6)
+    step = torch.tensor([0.3, -0.2]).double().expand_as(plane)
+    there = camera.bent_step(plane, step)
+    torch.testing.assert_close(there, step[:, :1] * numeric[0] + step[:, 1:] * numeric[1])
+    torch.testing.assert_close(camera.unbent_step(plane, there), step)
+    assert camera.shows(plane).all()
+    torch.testing.assert_close(camera.as_pinhole(pixels), camera.pinhole.pixels(plane))
+    square = plane.square().sum(-1)
+    for n, by in enumerate(camera.radial_shapes(square)[1:], 1):
+        changed = (
+            replace(camera, **{f"k{n}": getattr(camera, f"k{n}") + h}) for h in (1e-6, -1e-6)
+        )
+        high, low = (other.growth(square) for other in changed)
+        torch.testing.assert_close(by, (high - low) / 2e-6, atol=1e-8, rtol=1e-6)
+
+
+def opencv_pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+    none, K = np.zeros(3), camera.K
+    if not camera.is_fisheye:
+        return cv2.projectPoints(points, none, none, K, np.array(camera.distortion))[0]
+    k = np.array([camera.k1, camera.k2, camera.k3, camera.k4])
+    return cv2.fisheye.projectPoints(points[:, None], none, none, K, k)[0]
+
+
+@pytest.mark.parametrize("name", ["radial", "brown", "fisheye"])
+def test_a_camera_does_not_show_what_its_lens_folds_over(name):
+    camera = replace(CAMERA, **LENSES[name] | {"k1": -0.4, "k2": 0.0, "k3": 0.0, "k4": 0.0})
+    radius = torch.linspace(0.01, 3.0, 300).double()
+    plane = torch.stack([radius, torch.zeros_like(radius)], -1)
+    grows = camera.growth(radius.square()).mul(radius).diff() > 0
+    shown = camera.shows(plane)[:-1]
+    assert (grows | ~shown).all()
+    assert 0 < (grows & ~shown).sum() < 60  # where it hardly grows
+    assert shown[0]
 
 
 def test_moves_of_a_camera_add_up_and_are_found_again():

@@ -41,16 +41,14 @@ def linearised(
     row_y = [*(along_y * slope for slope in block.slopes), (ty - tz * v) * q]
     others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
     J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
-    square = u * u + v * v
-    point = x.mT[:, None]
-    inward = (J * point).sum(2, keepdim=True)
-    bent = (2 * lens.k1 + 4 * lens.k2 * square)[:, None, None]
-    J = J * lens.growth(square)[:, None, None] + bent * point * inward
+    xx, xy, yy = (each[:, None] for each in lens.bend_jacobian(x))
+    J = torch.stack([xx * J[:, :, 0] + xy * J[:, :, 1], xy * J[:, :, 0] + yy * J[:, :, 1]], 2)
     J = J * J.new_tensor([c.fx, c.fy])[:, None]
     p = block.project(T_cw, source, target, inverse_depth)
     centred = (p.pixels - p.pixels.new_tensor([c.cx, c.cy])).mT
-    bulge = (x * p.pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
-    own = torch.stack([centred, bulge, bulge * square[:, None]], 1)
+    flat = (x * p.pixels.new_tensor([c.fx, c.fy])).mT
+    _, by_k1, by_k2 = lens.radial_shapes(u * u + v * v)
+    own = torch.stack([centred, flat * by_k1[:, None], flat * by_k2[:, None]], 1)
     return p, torch.cat([J[:, :6], J[:, 6:9] + own], 1), J[:, 9]
 
 

@@ -8,9 +8,10 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 from torch import Tensor
 
+from geogs.camera.depth_images import sampled
 from geogs.camera.distortion import RESAMPLING, lens_maps
 from geogs.geometry.camera import Camera
 from geogs.types import FoundLens, FrameLens
@@ -64,6 +65,10 @@ class StraightView:
         """Straighten by nearest neighbours; beyond the border the nearest pixels count."""
         row, column = self._nearest
         return bent[row, column]
+
+    def depth(self, bent: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        """Straighten sensor depth; 0 where unknown."""
+        return sampled(bent, *self._maps)
 
     @cached_property
     def is_seen(self) -> Bool[np.ndarray, "h w"]:

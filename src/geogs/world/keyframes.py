@@ -118,8 +118,11 @@ class Keyframe:
     def prior_normal(self) -> Float[Tensor, "h w 3"] | None:
         """Unit normals of a monocular prior for the straight image, in the camera frame and facing
         the camera; zero where unknown, None without a prior."""
-        normal = self._straight_array("prior normal")
-        return None if normal is None else torch.from_numpy(normal)
+        normal = self.table.arrays.get("prior normal", self.id)
+        if normal is None:
+            return None
+        view = self.table.view_of(self.id)
+        return torch.from_numpy(normal if view is None else view.nearest(normal))
 
     @prior_normal.setter
     def prior_normal(self, normal: Float[Tensor, "h w 3"]) -> None:
@@ -128,19 +131,17 @@ class Keyframe:
     @property
     def sensor_depth(self) -> Float32[np.ndarray, "h w"] | None:
         """Sensor depth in metres for the straight image, 0 where unknown; None without."""
-        depth = self._straight_array("sensor depth")
-        return None if depth is None else depth.astype(np.float32)
+        depth = self.table.arrays.get("sensor depth", self.id)
+        if depth is None:
+            return None
+        view = self.table.view_of(self.id)
+        metres = depth.astype(np.float32)
+        return metres if view is None else view.depth(metres)
 
     @sensor_depth.setter
     def sensor_depth(self, metres: Float32[np.ndarray, "h w"]) -> None:
         # Half precision rounds by 0.05 %, a tenth of a sensor's error.
         self.table.arrays.put("sensor depth", self.id, metres.astype(np.float16))
-
-    def _straight_array(self, name: str) -> np.ndarray | None:
-        """Return a large array by the nearest pixels of the straight image."""
-        found = self.table.arrays.get(name, self.id)
-        view = self.table.view_of(self.id)
-        return found if found is None or view is None else view.nearest(found)
 
     def copied_to(self, table: "KeyframeTable") -> "Keyframe":
         """Copy it for another table, without the pose."""

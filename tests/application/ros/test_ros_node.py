@@ -113,8 +113,9 @@ class Tracked:
 
     frames = 0
 
-    def __init__(self, camera, config, device, live) -> None:
+    def __init__(self, camera, config, device, live, pinhole) -> None:
         assert live
+        assert camera == pinhole
 
     def process(self, image, seconds):
         self.frames += 1

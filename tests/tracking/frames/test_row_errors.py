@@ -1,5 +1,7 @@
 """What rectified rows are off by: against points followed through time one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frames.row_errors import LONGEST_INTERVAL, RowErrors, lagrange
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
-from lenses import with_lens
+from lenses import LENSES, with_lens
 
 CAMERA = Camera(220.0, 215.0, 157.0, 121.0, 320, 240)
 GRID = SampleGrid(CAMERA)
@@ -89,9 +91,10 @@ def test_points_lie_beside_where_a_wrong_motion_put_them(distortion):
 
 
 @pytest.mark.parametrize("device", ["loops", "plain"])
-def test_what_a_lens_shows_lies_where_the_pinhole_has_it_but_for_the_bend(device, monkeypatch):
+@pytest.mark.parametrize("name", LENSES)
+def test_what_a_lens_shows_lies_where_the_pinhole_has_it_but_for_the_bend(name, device):
     """All pixels being seen at one time, which is another than was assumed."""
-    lens = CAMERA.moved(0.0, 0.1, -0.15)
+    lens = replace(CAMERA, **LENSES[name])
     nodes = rows()[2]
     seen = SeenRows(torch.zeros_like(nodes.offset), torch.full_like(nodes.seconds, 0.02))
     pixels, d = GRID.pixels[None], torch.full((1, GRID.size), 0.7)
@@ -128,9 +131,9 @@ def test_a_match_is_corrected_at_both_its_ends():
     torch.testing.assert_close(both[small], (there - beside + p.pixels)[small], atol=0.01, rtol=0)
 
 
-@pytest.mark.parametrize("bend", [(0.0, 0.0), (0.1, -0.15)])
-def test_a_step_is_carried_as_finite_differences_carry_it(bend):
-    camera = CAMERA.moved(0.0, *bend)
+@pytest.mark.parametrize("name", LENSES)
+def test_a_step_is_carried_as_finite_differences_carry_it(name):
+    camera = replace(CAMERA, **LENSES[name])
     T_ji = se3_exp(torch.tensor([[0.3, -0.1, 0.4, 0.2, -0.3, 0.15]], dtype=torch.float64))
     d = torch.linspace(0.2, 1.5, GRID.size, dtype=torch.float64)[None]
     pixels, small = GRID.pixels.double(), 1e-5

@@ -18,7 +18,7 @@ _KEPT = ("take", "start", "stop", "stride", "field_of_view", "topic")
 
 
 def open_originals(result: SavedResult, paths: tuple[str, ...]) -> Source:
-    """Open what a run read: frames at full size, by the lens and readout that it ended with.
+    """Open what a run read: straight frames at full size, by its final lens and readout.
 
     Raises:
         InputError: it is not what the run read, or the result is not that of a run.
@@ -44,7 +44,7 @@ def open_originals(result: SavedResult, paths: tuple[str, ...]) -> Source:
             f"{', '.join(paths)}: the run of {result.folder} read something else; give by --images "
             "the video or folder that it read."
         )
-    return source
+    return source.straight()
 
 
 def keyframe_images(

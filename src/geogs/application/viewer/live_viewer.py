@@ -99,7 +99,7 @@ class LiveViewer(RunObserver):
             f"frame {status.frames}: {status.state.value}",
             f"{status.keyframes} keyframes, {status.disks} disks, {loops} loops",
         )
-        picture = frame.image
+        picture = slam.straightened(frame.image)
         layer = self._window.layer
         if layer != "image" and (searched := slam.depth_maps()):
             picture = layer_picture(searched[len(searched) - 1], layer)

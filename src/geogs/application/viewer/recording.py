@@ -71,7 +71,7 @@ class Recorder(RunObserver):
         )
         stream.log("world/camera/image", lens)
         # Quality of the JPEG images.
-        stream.log("world/camera/image", rerun.Image(frame.image).compress(70))
+        stream.log("world/camera/image", rerun.Image(slam.straightened(frame.image)).compress(70))
         stream.log("keyframes", rerun.Scalars(status.keyframes))
         stream.log("disks", rerun.Scalars(status.disks))
         if status.keyframes // _EVERY > before // _EVERY:

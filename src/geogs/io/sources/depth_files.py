@@ -1,7 +1,6 @@
 """Sensor depth: depth images beside the colour images, registered to their pixels."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -10,13 +9,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 
+from geogs.camera.depth_images import sampled
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import decoded
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.undistort import Rectifier
 
-SAME_SURFACE = 0.03
-"""Relative difference of depth up to which neighbouring pixels are interpolated."""
 INVALID = 65535
 """Value for unknown depth of some sensors, besides 0."""
 
@@ -132,26 +130,6 @@ class RectifiedDepth:
         x = (u + 0.5) * (width / resized.width) - 0.5
         y = (v + 0.5) * (height / resized.height) - 0.5
         return sampled(depth, x.astype(np.float32), y.astype(np.float32))
-
-
-def sampled(
-    depth: Float32[np.ndarray, "h w"],
-    x: Float32[np.ndarray, "h2 w2"],
-    y: Float32[np.ndarray, "h2 w2"],
-) -> Float32[np.ndarray, "h2 w2"]:
-    """Depth at any columns and rows: interpolated on a surface, the nearest pixel's at its edge.
-
-    Inverse depth is interpolated, which is linear on planes. 0 where unknown.
-    """
-    known = (depth > 0).astype(np.float32)
-    inverse = known / np.where(known > 0, depth, 1)
-    at = partial(cv2.remap, map1=x, map2=y, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-    linear = at(inverse, interpolation=cv2.INTER_LINEAR)
-    fraction = at(known, interpolation=cv2.INTER_LINEAR)
-    nearest = at(inverse, interpolation=cv2.INTER_NEAREST)
-    smooth = (fraction > 0.999) & (np.abs(linear - nearest) < SAME_SURFACE * nearest)
-    chosen = np.where(smooth, linear, nearest)
-    return np.where(chosen > 0, 1 / np.where(chosen > 0, chosen, 1), 0).astype(np.float32)
 
 
 def registered(
