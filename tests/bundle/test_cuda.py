@@ -25,6 +25,7 @@ from geogs.bundle.terms import DepthDamping, MeasuredDepths, MeasuredMotions
 from geogs.config import Config
 from geogs.geometry.camera import LEAST_SLOPE, Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.gpu.kernel_source import INCLUDE_FOLDER
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
@@ -102,7 +103,8 @@ def assert_same(fast: BundleResult, slow: BundleResult) -> None:
 
 def test_sources_and_python_agree_on_sizes():
     folder = Path(cuda_bundle.__file__).parent
-    text = "".join((folder / name).read_text() for name in ("solve.cu", "projection.cuh"))
+    files = folder / "solve.cu", folder / "projection.cuh", INCLUDE_FOLDER / "lens.cuh"
+    text = "".join(file.read_text() for file in files)
     found = {k: float(v) for k, v in re.findall(r"#define (\w+) ([\d.]+)", text)}
     assert found["MAX_POSES"] == cuda_bundle.MAX_FEW
     assert found["PANEL"] == cuda_bundle.PANEL

@@ -27,8 +27,8 @@ class CalibrationConfig(Settings, group="calibration"):
     refine: bool = True
     """Whether a guessed focal length, or one from EXIF, is refined before the run."""
     radial: bool = True
-    """Find the distortion with it (OpenCV's k1 and k2), unless that is given, and undistort the
-    images by it. Off for a lens that bends nothing."""
+    """Find the distortion with it (OpenCV's k1 and k2), unless that is given. Off for a lens that
+    bends nothing."""
 
 
 @dataclass(frozen=True)

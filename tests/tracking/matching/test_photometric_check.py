@@ -1,5 +1,7 @@
 """The images' word on a location: against the obvious reference, and what it tells apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,6 +18,7 @@ from geogs.tracking.matching.photometric_check import (
     reprojected_windows,
 )
 from geogs.world.grid import SampleGrid
+from lenses import LENSES
 from tracking_scenes import CAMERA, pose, render
 
 GRID = SampleGrid(CAMERA)
@@ -113,6 +116,26 @@ def test_windows_follow_the_camera_when_it_turns_and_comes_near():
     assert found.windows > 100
     assert found.correlation > 0.97
     assert shifted.correlation < 0.6
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_windows_bend_as_the_lens_bends_them(name):
+    """Against each pixel's own ray; a window is linear to first order."""
+    grid = SampleGrid(replace(CAMERA, **LENSES[name]))
+    camera, some = grid.camera, photometric_check._spread(grid)
+    T = relative(pose(0.2, yaw=0.05))
+    depth = torch.linspace(0.3, 0.6, grid.size)
+    pixels = grid.pixels[some, None] + photometric_check._offsets(grid)
+    plane = camera.plane(pixels.double())
+    points = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
+    seen = points @ T[:3, :3].mT + depth[some, None, None] * T[:3, 3]
+    wanted = camera.pixels(seen[..., :2] / seen[..., 2:])
+    found = reprojected_windows(grid, T, depth)
+    off = (found - wanted).norm(dim=-1)
+    middle = found.shape[1] // 2
+    assert float(off.max()) < 0.3
+    assert float(off[:, middle - 1 : middle + 2].max()) < 0.03
+    torch.testing.assert_close(found[:, middle].double(), wanted[:, middle], atol=1e-3, rtol=0)
 
 
 def test_one_place_is_told_from_noise_and_from_another():

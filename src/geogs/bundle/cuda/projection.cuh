@@ -1,16 +1,10 @@
 // Projection of the cells of a source frame with inverse depth d: pi(K (R ray + d t)).
 #pragma once
 #include "block.cuh"
+#include "lens.cuh"
 #include "pose.cuh"
 
 #define MIN_Z 0.05f
-#define LEAST_SLOPE 0.1f
-
-// Pixel = c + f b(x) of a point x on the plane z = 1: see geogs/geometry/camera.py.
-struct Camera { float fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, fisheye; };
-
-// The distortion in the arguments of a kernel, in the order of Camera.numbers.
-#define LENS k1, k2, p1, p2, k3, k4, k5, k6, fisheye
 
 // The upper three rows R | t of the motion from the source to the target.
 struct Motion { float m[12]; };
@@ -32,50 +26,13 @@ __device__ __forceinline__ Projected project_cell(
   return {x * q, y * q, z, q, z > MIN_Z};
 }
 
-// Growth of the radius at a squared distance from the axis, twice its derivative by that, and the
-// slope that is small where the image folds over.
-struct Growth { float growth, slope, steepness; };
-
-__device__ __forceinline__ Growth growth_at(const Camera& c, float square) {
-  if (c.fisheye > 0.f) {
-    float radius = sqrtf(square), angle = atanf(radius), s = angle * angle;
-    float straight = square > 0.f ? angle / radius : 1.f;
-    float growth = straight * (1.f + s * (c.k1 + s * (c.k2 + s * (c.k3 + s * c.k4))));
-    float steepness =
-        1.f + s * (3.f * c.k1 + s * (5.f * c.k2 + s * (7.f * c.k3 + s * 9.f * c.k4)));
-    float slope = square > 1e-4f ? (steepness / (1.f + square) - growth) / square
-                                 : 2.f * c.k1 - 2.f / 3.f;
-    return {growth, slope, steepness};
-  }
-  float under = 1.f + square * (c.k4 + square * (c.k5 + square * c.k6));
-  float growth = (1.f + square * (c.k1 + square * (c.k2 + square * c.k3))) / under;
-  float slope = 2.f * c.k1 + square * (4.f * c.k2 + 6.f * square * c.k3);
-  slope -= growth * (2.f * c.k4 + square * (4.f * c.k5 + 6.f * square * c.k6));
-  slope /= under;
-  return {growth, slope, growth + square * slope};
-}
-
-__device__ __forceinline__ float2 pixel_of(const Camera& c, const Projected& p) {
-  float xx = p.x * p.x, xy = p.x * p.y, yy = p.y * p.y, growth = growth_at(c, xx + yy).growth;
-  float x = p.x * growth + 2.f * c.p1 * xy + c.p2 * (3.f * xx + yy);
-  float y = p.y * growth + c.p1 * (xx + 3.f * yy) + 2.f * c.p2 * xy;
-  return make_float2(c.fx * x + c.cx, c.fy * y + c.cy);
+__device__ __forceinline__ float2 pixel_of(const Camera& camera, const Projected& p) {
+  return lens_pixel(camera, p.x, p.y);
 }
 
 // Whether a point lies before the target, and where the lens does not fold the image over.
-__device__ __forceinline__ bool is_shown(const Camera& c, const Projected& p) {
-  return p.valid && growth_at(c, p.x * p.x + p.y * p.y).steepness > LEAST_SLOPE;
-}
-
-// Derivatives of a pixel by its point on the plane z = 1.
-struct Bend { float xx, xy, yx, yy; };
-
-__device__ __forceinline__ Bend bend_of(const Camera& c, float x, float y) {
-  Growth g = growth_at(c, x * x + y * y);
-  float xx = g.growth + g.slope * x * x + 2.f * c.p1 * y + 6.f * c.p2 * x;
-  float xy = g.slope * x * y + 2.f * c.p1 * x + 2.f * c.p2 * y;
-  float yy = g.growth + g.slope * y * y + 6.f * c.p1 * y + 2.f * c.p2 * x;
-  return {c.fx * xx, c.fx * xy, c.fy * xy, c.fy * yy};
+__device__ __forceinline__ bool is_shown(const Camera& camera, const Projected& p) {
+  return p.valid && growth_at(camera, p.x * p.x + p.y * p.y).steepness > LEAST_SLOPE;
 }
 
 // A measured cell, linearised in a left perturbation of the motion and in its inverse depth.

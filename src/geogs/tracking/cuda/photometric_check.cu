@@ -1,5 +1,6 @@
 // Whether two images agree where a pose, or a flow, puts what the first shows.
 #include "block.cuh"
+#include "lens.cuh"
 
 #define SIDE 9        // pixels along the edge of a window
 #define INNER 7       // means of 3 x 3 pixels along it
@@ -20,12 +21,16 @@ __device__ __forceinline__ float bilinear(const float* image, int width, int hei
 extern "C" __global__ void correlate_windows(
     const float* first, const float* second, int width, int height, const float* rays,
     int grid_width, int stride, int step, int count, const double* T, const float* inverse_depth,
-    const float* information, const float2* pixels, float fx, float fy, float cx, float cy,
+    const float* information, const float2* pixels, float fx, float fy, float cx, float cy, float k1,
+    float k2, float p1, float p2, float k3, float k4, float k5, float k6, float fisheye,
     float least_variance, unsigned* keys) {
   __shared__ float here[WINDOWS][SIDE * SIDE], there[WINDOWS][SIDE * SIDE];
   int lane = threadIdx.x, warp = threadIdx.y, n = blockIdx.x * WINDOWS + warp;
   bool counts = n < count;
   int cell = counts ? n * step : 0;
+  Camera camera = {fx, fy, cx, cy, LENS};
+  Bend bend = bend_of(camera, rays[3 * cell], rays[3 * cell + 1]);
+  float area = bend.xx * bend.yy - bend.xy * bend.yx;
   float R[9], middle[3];
   if (T) {
     for (int r = 0; r < 3; r++) {
@@ -44,9 +49,13 @@ extern "C" __global__ void correlate_windows(
     here[warp][k] = first[(size_t)min(top + j, height - 1) * width + min(left + i, width - 1)];
     float dx = i - FROM_MIDDLE, dy = j - FROM_MIDDLE, x, y;
     if (T) {
-      float z = middle[2] + R[6] / fx * dx + R[7] / fy * dy;
-      x = fx * (middle[0] + R[0] / fx * dx + R[1] / fy * dy) / z + cx;
-      y = fy * (middle[1] + R[3] / fx * dx + R[4] / fy * dy) / z + cy;
+      // The ray moves by what the lens shows as (dx, dy).
+      float u = (bend.yy * dx - bend.xy * dy) / area, v = (bend.xx * dy - bend.yx * dx) / area;
+      float z = middle[2] + R[6] * u + R[7] * v;
+      float2 at = lens_pixel(camera, (middle[0] + R[0] * u + R[1] * v) / z,
+                             (middle[1] + R[3] * u + R[4] * v) / z);
+      x = at.x;
+      y = at.y;
       counts = counts && z > 1e-6f;
     } else {
       x = pixels[cell].x + dx;

@@ -42,7 +42,7 @@ def median_correlation(
         -(-count // WINDOWS), (32, WINDOWS), first.contiguous(), second.contiguous(), c.width,
         c.height, grid.rays, grid.width, STRIDE, step, count,
         *(None if x is None else x.contiguous() for x in where),
-        c.fx, c.fy, c.cx, c.cy, least_variance, keys,
+        *c.numbers, least_variance, keys,
     )  # fmt: skip
     kernels["median_correlation"](1, 256, keys, count, found)
     return found

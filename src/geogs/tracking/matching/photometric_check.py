@@ -70,7 +70,7 @@ def correlation_at(
     which may be on the CPU, are on the grid's device; so is the result, and nothing waits for a
     GPU.
     """
-    if grid.on_gpu and grid.camera.is_pinhole:
+    if grid.on_gpu:
         from geogs.tracking.cuda.photometric_check import median_correlation
 
         step = _spread(grid).step
