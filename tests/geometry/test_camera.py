@@ -102,6 +102,13 @@ def test_a_camera_does_not_show_what_its_lens_folds_over(name):
     assert (grows | ~shown).all()
     assert 0 < (grows & ~shown).sum() < 60  # where it hardly grows
     assert shown[0]
+    beyond = torch.tensor([[5e3, 5e1], [-3e3, 1e4], [1e6, -1e6]])
+    found = camera.plane(beyond)
+    assert found.isfinite().all()
+    farthest = (
+        float(radius[:-1][shown].max()) if camera.is_fisheye else float(found.norm(dim=-1)[0])
+    )
+    torch.testing.assert_close(found.norm(dim=-1), torch.full((3,), farthest), atol=0.02, rtol=0.3)
 
 
 def test_moves_of_a_camera_add_up_and_are_found_again():

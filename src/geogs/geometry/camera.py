@@ -210,11 +210,10 @@ class Camera:
 
     @cached_property
     def _widest_angle(self) -> float:
-        """Angle up to which a fisheye's radius grows, at most the limit."""
+        """Angle from the axis up to which the image is not folded over, at most the limit."""
         angles = torch.linspace(0.0, FISHEYE_LIMIT, 1000, dtype=torch.float64)
-        radius = angles * self._angle(angles.tan().square())[1]
-        falls = torch.nonzero(radius.diff() <= 0)
-        return float(angles[falls[0, 0]]) if len(falls) else FISHEYE_LIMIT
+        folded = torch.nonzero(self.steepness(angles.tan().square()) <= LEAST_SLOPE)
+        return float(angles[folded[0, 0]]) if len(folded) else FISHEYE_LIMIT
 
     def _angle(self, square: Float[Tensor, "*b"]) -> tuple[Tensor, Tensor]:
         """Return the angle from the axis, and the factor by which a fisheye bends it."""
@@ -240,13 +239,13 @@ class Camera:
 
     def straight(self, bent: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """Undistort to points x / z, y / z; source: Newton's method on the radius, and then on the
-        point where there are tangential terms. Rays of a fisheye are at most ``FISHEYE_LIMIT`` from
-        the axis."""
+        point where there are tangential terms. Where the lens shows nothing the farthest point that
+        it shows that way is returned, or one at ``FISHEYE_LIMIT`` from the axis."""
         if self.is_pinhole:
             return bent
         radius = bent.norm(dim=-1, keepdim=True)
+        widest = self._widest_angle
         if self.is_fisheye:
-            widest = self._widest_angle
             angle = radius.clamp(max=widest)
             for _ in range(2 * _RADIAL_STEPS):
                 square = angle.tan().square()
@@ -254,14 +253,16 @@ class Camera:
                 step = over / self._angle_slope(square).clamp(min=LEAST_SLOPE)
                 angle = (angle - step).clamp(0.0, widest)
             return torch.where(radius > 0, bent * (angle.tan() / radius.clamp(min=1e-30)), bent)
-        s = radius
+        farthest = math.tan(widest)
+        s = radius.clamp(max=farthest)
         for _ in range(_RADIAL_STEPS):
             square = s.square()
             slope = self.steepness(square).clamp(min=LEAST_SLOPE)
-            s = s - (s * self.growth(square) - radius) / slope
-        plane = bent / self.growth(s.square())
+            s = (s - (s * self.growth(square) - radius) / slope).clamp(0.0, farthest)
+        plane = torch.where(radius > 0, bent * (s / radius.clamp(min=1e-30)), bent)
         for _ in range(_PLANE_STEPS if self.p1 or self.p2 else 0):
-            plane = plane + self.unbent_step(plane, bent - self.bent(plane))
+            step = self.unbent_step(plane, bent - self.bent(plane))
+            plane = plane + torch.where(self.shows(plane)[..., None], step.clamp(-1.0, 1.0), 0.0)
         return plane
 
     def plane(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
