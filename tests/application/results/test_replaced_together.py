@@ -35,6 +35,7 @@ from geogs.application.run_settings import RunSettings
 from geogs.cli.main import main
 from geogs.config import Config, InputConfig, MeshConfig
 from geogs.errors import DeviceError, OutputError
+from geogs.evaluation.model_view.levelling import Level
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh, write_splats
@@ -127,10 +128,12 @@ def quick(monkeypatch) -> None:
     monkeypatch.setattr(surfaces, "extract_mesh", lambda *_: surface)
     found = MetricScale("a known distance", FACTOR, 0.01)
     monkeypatch.setattr(rescale, "find_scale", lambda *_: found)
-    for module in ("run_page", "evaluation_page"):
-        monkeypatch.setattr(
-            f"geogs.evaluation.pages.{module}.model_section", lambda model: ("", ())
-        )
+    for module in ("results.result_page", "evaluate"):  # pages without a model
+        monkeypatch.setattr(f"geogs.application.{module}.shown_model", lambda *_, **__: None)
+    level = Level(np.eye(3), None)
+    for module in ("result_page", "saved_result"):
+        monkeypatch.setattr(f"geogs.application.results.{module}.upright", lambda *_: level)
+    monkeypatch.setattr("geogs.mapping.rendered.averaged_over_planes", lambda depth, *_: depth)
 
 
 def a_run(scene: SavedScene, images: Path) -> Callable[[Path], object]:
