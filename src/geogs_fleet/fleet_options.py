@@ -65,3 +65,5 @@ class JoinOptions(FleetOptions):
     adjust: Annotated[bool, Basic()] = True
     """Adjust the poses of all keyframes with the matches between overlapping parts; without it, the
     parts are only moved and bent to fit each other."""
+    overwrite: bool = False
+    """Replace the result that is in the folder; it stays until the new one is complete."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geogs.application.results.output_folder import claimed
+from geogs.application.results.output_folder import chosen_folder, claimed
 from geogs.cli.options import record
 from geogs.config import Config
 from geogs.errors import InputError
@@ -38,12 +38,14 @@ def run_join(
 
     Raises:
         InputError: a part is unusable, no two of them overlap, or Ray is missing.
-        OutputError: the result cannot be written.
+        OutputError: the folder holds a result, which ``settings`` do not let be replaced, or it
+            cannot be written.
     """
     path = StoragePath(settings.output).path if settings.output else None
     if path is None:
         raise InputError("The joint result needs a folder that all machines see; give one (-o).")
-    with claimed(path.absolute()) as output, ray_cluster(settings.address) as ray:
+    place = chosen_folder(path.absolute(), "", settings.overwrite)
+    with claimed(place) as output, ray_cluster(settings.address) as ray:
         allocation = allocation_for(ray, settings)
         if allocation.gpus and config_on_gpu is not None:
             settings = replace(settings, config=config_on_gpu)

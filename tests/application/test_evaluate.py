@@ -13,6 +13,7 @@ from box_room import CAMERA, box, circle
 from geogs.application.evaluate import evaluate, find_surface
 from geogs.application.result_settings import EvalSettings
 from geogs.cli.eval import main
+from geogs.cli.main import main as geogs_main
 from geogs.errors import InputError
 from geogs.geometry.lie import so3_exp
 from geogs.io.pose_files import read_poses, read_tum_trajectory
@@ -269,3 +270,30 @@ def test_dtu_runs_from_the_command(tmp_path):
     assert surface["s2d_mm"] == pytest.approx(0.415, abs=0.015)
     assert surface["d2s_left_out"] == 0.0
     assert "overall (mm)" in (out / "report" / "index.html").read_text()
+
+
+@pytest.mark.parametrize("place", ["", "truth", "out"])
+def test_the_mesh_of_the_result_is_not_taken_for_the_truth(result, place):
+    """Where true poses lie in the folder of the result, or in one inside."""
+    truth, out = result
+    folder = out / place
+    folder.mkdir(exist_ok=True)
+    poses = (truth / "traj.txt").rename(folder / "traj.txt")
+    for given in (poses, folder):
+        assert find_surface(EvalSettings(output=out, gt=given)) == (None, None)
+    evaluation = evaluate(EvalSettings(output=out, gt=poses, plots=False))
+    assert evaluation.reconstruction is None
+    assert evaluation.settings["true_surface"] is None
+
+
+def test_the_answer_is_what_was_found_and_not_what_lies_in_the_folder(result, capsys, monkeypatch):
+    truth, out = result
+    words = ["eval", str(out), "--gt", str(truth), "--no-plots", "--samples", "5000", "--json"]
+    assert geogs_main(words) == 0
+    errors = json.loads(capsys.readouterr().out)["errors"]
+    assert errors == json.loads((out / "eval.json").read_text())
+    monkeypatch.setattr("geogs.application.evaluate.write_report", lambda *_: None)
+    for other in ("{", '{"trajectory": {"ate_rmse_cm": 99}}'):
+        (out / "eval.json").write_text(other)
+        assert geogs_main(words) == 0
+        assert json.loads(capsys.readouterr().out)["errors"] == errors

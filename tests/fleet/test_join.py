@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from geogs.errors import InputError
+from geogs.errors import InputError, OutputError
+from geogs_fleet import join_run
 from geogs_fleet.fleet_options import JoinOptions
 from geogs_fleet.join_run import _names, finished_results, run_join
 
@@ -35,3 +36,23 @@ def test_equal_names_are_told_apart(tmp_path):
 def test_the_joint_result_needs_a_folder(output):
     with pytest.raises(InputError, match="needs a folder that all machines see"):
         run_join(JoinOptions(("a", "b"), output=output))
+
+
+@pytest.mark.parametrize("kept", ['{"source": "a + b"}', '{"source": "video.mp4"}', "{", "[]"])
+def test_a_result_is_replaced_only_where_that_is_asked_for(tmp_path, monkeypatch, kept):
+    def begun(address: str) -> None:
+        raise InterruptedError
+
+    monkeypatch.setattr(join_run, "ray_cluster", begun)
+    summary = tmp_path / "summary.json"
+    summary.write_text(kept)
+    with pytest.raises(OutputError, match="--overwrite to replace it"):
+        run_join(JoinOptions(("a", "b"), output=str(tmp_path)))
+    assert [*tmp_path.iterdir()] == [summary]
+    assert summary.read_text() == kept
+    for options in (
+        JoinOptions(("a", "b"), output=str(tmp_path), overwrite=True),
+        JoinOptions(("a", "b"), output=str(tmp_path / "new")),
+    ):
+        with pytest.raises(InterruptedError):
+            run_join(options)

@@ -151,7 +151,8 @@ def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
     folder = (settings.gt if settings.gt.is_dir() else settings.gt.parent).resolve()
     mesh = settings.gt_mesh
     points = settings.gt_points
-    for place in (folder, folder.parent):
+    own = settings.output.resolve()  # whose mesh is no truth
+    for place in (place for place in (folder, folder.parent) if place != own):
         names = ["mesh.ply", f"{folder.name}_mesh.ply", "mesh_*.ply", "tsdf_pseudo_gt.ply"]
         found = [path for name in names for path in sorted(place.glob(name))]
         mesh = mesh or next(iter(found), None)

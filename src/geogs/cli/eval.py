@@ -16,7 +16,6 @@ def main(argv: Sequence[str]) -> Answer:
 
     from geogs.application.evaluate import evaluate
     from geogs.evaluation.pages.evaluation_page import table
-    from geogs.guard.documents import read_json
 
     evaluation = evaluate(options)
     errors = evaluation.trajectory
@@ -29,6 +28,9 @@ def main(argv: Sequence[str]) -> Answer:
         Console(stderr=True).print(
             printable(f"warning: {sentence}"), markup=False, style="bold red", highlight=False
         )
-    found = read_json(options.output / "eval.json")
-    values = {"folder": options.output, "errors": found, "warnings": list(evaluation.doubts)}
+    values = {
+        "folder": options.output,
+        "errors": evaluation.as_dict(),
+        "warnings": list(evaluation.doubts),
+    }
     return Answer("", values)

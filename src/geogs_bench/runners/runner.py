@@ -155,7 +155,8 @@ def correct_saved_map(settings: RunSettings, output: Path, progress: RunProgress
         cameras = source.image_camera, source.camera
         slam = Slam(cameras[0], settings.config, str(device), world=world, pinhole=cameras[1])
     slam.adjust(progress.stage)
-    write_results(output, Result(slam, source, False, progress), keyframe_images=False)
+    result = Result(slam, source, False, progress)
+    write_results(output, result, keyframe_images=False, overwrite=True)
 
 
 def _saved(place: Path, settings: RunSettings) -> SavedRun | None:

@@ -9,14 +9,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from disk_faults import full_disk
+from disk_faults import contents, full_disk
 from geogs.application import driver
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import chosen_folder, claimed, is_complete
+from geogs.application.results.result import Result
+from geogs.application.results.write import write_results
 from geogs.application.run_settings import RunSettings
-from geogs.errors import GeogsError, TrackingLost
+from geogs.errors import GeogsError, OutputError, TrackingLost
 from geogs.io.sources.frame_source import Source
 from geogs.stopwatch import Stopwatch
 
@@ -95,3 +97,42 @@ def test_a_complete_result_goes_only_where_that_was_asked_for(tmp_path, monkeypa
         if end is Outcome.FINISHED and (overwrite or not given):
             assert after[number]
         assert not list(tmp_path.glob("**/.geogs.*.new"))
+
+
+class Named(Source):
+    """A source that is known by its name."""
+
+    def __init__(self, name: str) -> None:
+        self._named = name
+
+    def fingerprint(self) -> str:
+        return self._named
+
+
+def test_a_result_written_by_a_program_goes_only_where_that_was_asked_for(tmp_path, monkeypatch):
+    def write(new: Path, result: Result, **_: object) -> None:
+        known = {"interrupted": result.is_interrupted, "fingerprint": result.source.fingerprint()}
+        (new / "summary.json").write_text(json.dumps(known))
+        if result.scene.mesh:
+            (new / "mesh.ply").write_bytes(bytes(40))
+
+    monkeypatch.setattr("geogs.application.results.write.write_files", write)
+
+    def put(source: str, interrupted: bool = False, mesh: bool = True, **given: bool) -> None:
+        result = Result(SimpleNamespace(mesh=mesh), Named(source), interrupted)
+        write_results(tmp_path / "kept", result, **given)
+
+    put("a", interrupted=True)
+    put("a")
+    before = contents(tmp_path)
+    for overwrite in (False, True):
+        for bad in ({"interrupted": True}, {"mesh": False}):
+            with pytest.raises(OutputError, match="this one is incomplete; give another folder"):
+                put("a", **bad, overwrite=overwrite)
+            assert contents(tmp_path) == before
+    with pytest.raises(OutputError, match="--overwrite to replace it"):
+        put("b")
+    assert contents(tmp_path) == before
+    put("a")
+    put("b", overwrite=True)
+    assert '"fingerprint": "b"' in (tmp_path / "kept" / "summary.json").read_text()

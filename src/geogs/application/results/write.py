@@ -6,13 +6,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
-from geogs.application.results.output_folder import claimed
+from geogs.application.results.output_folder import chosen_folder, claimed, is_complete
 from geogs.application.results.result import Result
 from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.summary import source_summary, statistics, summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.application.settings_file import settings_text
 from geogs.config import Config, ReconstructConfig
+from geogs.errors import OutputError
 from geogs.evaluation.pages.run_page import lengths
 from geogs.guard.atomic import write_text
 from geogs.guard.replacement import replaced
@@ -26,17 +27,32 @@ from geogs.threads import on_one_torch_thread
 from geogs.types import RenderedKeyframe
 
 
-def write_results(output: str | Path, result: Result, keyframe_images: bool = True) -> None:
-    """Write all files of a result into a folder; an earlier result is replaced.
+def write_results(
+    output: str | Path, result: Result, keyframe_images: bool = True, overwrite: bool = False
+) -> None:
+    """Write all files of a result into a folder; an earlier one of the same source is replaced.
 
-    ``keyframe_images``: whether the images of the keyframes are written, too. If a file cannot be
-    written, the earlier result stays.
+    If a file cannot be written, the earlier result stays.
+
+    Args:
+        output: folder of the result.
+        result: the result.
+        keyframe_images: whether the images of the keyframes are written, too.
+        overwrite: whether the result of another source, or an unfinished run, may be replaced.
 
     Raises:
-        OutputError: a file cannot be written.
+        OutputError: the folder holds a result that may not be replaced, as a complete one by one
+            that is not, or a file cannot be written.
     """
-    with claimed(Path(output)) as folder, replaced(folder, "result") as new:
+    wanted = Path(output)
+    chosen_folder(wanted, "", overwrite, result.progress, result.source.fingerprint)
+    with claimed(wanted) as folder, replaced(folder, "result") as new:
         write_files(new, result, keyframe_images=keyframe_images)
+        if is_complete(folder) and not is_complete(new):
+            raise OutputError(
+                f"{wanted} holds a complete result, and this one is incomplete; give another "
+                "folder."
+            )
 
 
 @on_one_torch_thread
