@@ -198,6 +198,7 @@ def test_what_the_board_cannot_do_is_a_sentence(arguments, sentence, tmp_path, c
 
 
 @pytest.mark.system
+@pytest.mark.long  # a run in a process that compiles nothing: 40 s; its steps have tests above
 def test_a_row_end_to_end(tmp_path, monkeypatch, capsys):
     footage = Footage("den", "handheld", "clean", 0, Size(30, 128, 96), TINY)
     quick = "--preset fast --mapping.final-iterations 20 --no-fallback"

@@ -27,7 +27,8 @@ def room(small_room, tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_benchmark_runs_scores_and_resumes(room, tmp_path, capsys):
+def test_a_benchmark_runs_scores_and_resumes(room, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("geogs.evaluation.pages.shading._WIDTH", 120)
     output = tmp_path / "out"
     settings = [word for text in TINY for word in ("--set", text)]
     call = ["bench", "rooms", str(room), "--known-poses", "--budgets", "1", "-o", str(output),

@@ -154,8 +154,8 @@ def rolled(count: int, readout: float) -> Iterator[Frame]:
         image = np.zeros((height, CAMERA.width, 3), np.uint8)
         for top in range(0, height, band):
             middle = (top + (band - 1) / 2 + 0.5) / height - 0.5
-            seen = render(at(k + 30 * readout * middle))[0]
-            image[top : top + band] = seen[top : top + band]
+            rows = replace(CAMERA, cy=CAMERA.cy - top, height=band)
+            image[top : top + band] = render(at(k + 30 * readout * middle), rows)[0]
         yield Frame(k, k / 30, image)
 
 
@@ -210,7 +210,7 @@ def test_a_camera_that_only_turns_tells_its_focal_length():
 
 
 def test_a_camera_that_never_turns_does_not_tell_it():
-    path = [pose(-0.5 + 0.04 * k, 0.1 * np.sin(0.5 * k), 0.0, 0.0) for k in range(24)]
+    path = [pose(-0.5 + 0.04 * k, 0.1 * np.sin(0.5 * k), 0.0, 0.0) for k in range(16)]
     guess = CAMERA.with_focal(120.0)
     found = self_calibrate(frames(path), guess, Unknowns(radial=True))
     assert found.failure is not None
