@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.export.export import export, exports_of
+from geogs.application.reconstruct import ReconstructState
 from geogs.application.result_settings import RescaleSettings
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.result_page import write_page_anew
@@ -67,10 +69,7 @@ def rescale(settings: RescaleSettings) -> MetricScale:
         raise InputError(f"Nothing is known of the scale; {HOW.replace(' or sensor', '')}.")
     folder = result_folder(settings.result)
     if has_checkpoint(folder):
-        raise InputError(
-            f"{folder} holds an unfinished run; geogs run --resume {folder} --scale-from "
-            f"{settings.scale_from} finishes it in metres."
-        )
+        raise InputError(f"{folder} holds an unfinished {_way_on(folder, settings.scale_from)}")
     exports = exports_of(folder, settings.device)
     with claimed(folder), replaced(folder, "part", _EVALUATION) as new:
         result = load_result(folder, require_device(settings.device))
@@ -85,6 +84,18 @@ def rescale(settings: RescaleSettings) -> MetricScale:
     for exported in exports:
         export(exported.scaled(found.factor))
     return found
+
+
+def _way_on(folder: Path, scale_from: str) -> str:
+    """The command that finishes the work of a folder, of which a run makes metres by itself."""
+    if has_checkpoint(folder, ReconstructState):
+        words = shlex.join(["--resume", str(folder)])
+        return (
+            f"reconstruction; finish it first: geogs reconstruct {words}, with its source and "
+            "settings."
+        )
+    words = shlex.join(["--resume", str(folder), "--scale-from", scale_from])
+    return f"run; geogs run {words} finishes it in metres."
 
 
 def _factor(result: SavedResult) -> float:

@@ -2,12 +2,17 @@
 
 import json
 import re
+import shlex
 
 import numpy as np
 import pytest
 
 import geogs
+from disk_faults import contents
+from geogs.application.checkpoints.checkpoint import checkpoint_folder
+from geogs.application.checkpoints.run_state import RunState
 from geogs.application.export.export import EXPORTS, export
+from geogs.application.reconstruct import ReconstructState
 from geogs.application.rescale import rescale
 from geogs.application.result_settings import ExportSettings, RemeshSettings, RescaleSettings
 from geogs.application.results.revise import mesh_settings, remesh
@@ -23,6 +28,7 @@ from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map
 from geogs.io.writers.ply_writer import write_splats
 from geogs.mesh.extract import extract_mesh
+from geogs.world.kinds import schema
 from saved_results import BLOCK, CAMERA, ORIGIN, UNIT, WALL, make_result
 
 FINE = MeshConfig(voxel=0.12, min_component_faces=10)
@@ -143,10 +149,25 @@ def test_a_damaged_list_of_exports_is_an_error_in_a_sentence(folder, listed, cap
     assert json.loads((folder / "summary.json").read_text())["scale"] == "arbitrary"
 
 
-def test_an_unfinished_run_is_finished_in_metres_instead(folder, capsys, monkeypatch):
-    monkeypatch.setattr("geogs.application.rescale.has_checkpoint", folder.__eq__)
+@pytest.mark.parametrize("name", ["out", "my out"])
+@pytest.mark.parametrize(
+    ("state", "command"),
+    [
+        (RunState, f"geogs run --resume {{}} --scale-from {KNOWN} finishes it in metres."),
+        (ReconstructState, "geogs reconstruct --resume {}, with its source and settings."),
+    ],
+)
+def test_what_is_unfinished_names_the_command_that_finishes_it(
+    tmp_path, capsys, state, command, name
+):
+    """In metres at once where that command can do that."""
+    folder = make_result(tmp_path / name)
+    before = contents(folder)
+    with checkpoint_folder(folder).replaced(schema(state), {}) as write:
+        write("json", b"{}")
     assert main(["scale", str(folder), "--from", KNOWN, "--device", "cpu"]) == 2
-    assert f"geogs run --resume {folder} --scale-from {KNOWN}" in capsys.readouterr().err
+    assert command.format(shlex.quote(str(folder))) in capsys.readouterr().err
+    assert before.items() <= contents(folder).items()
 
 
 def test_what_cannot_be_scaled_stays_as_it_is(folder, capsys):

@@ -177,10 +177,12 @@ def checkpoint_folder(output: Path) -> CheckpointFolder:
     return CheckpointFolder(output / "checkpoint")
 
 
-def has_checkpoint(output: Path) -> bool:
-    """Whether the work of a folder can be resumed."""
+def has_checkpoint(output: Path, kind: type | None = None) -> bool:
+    """Whether the work of a folder can be resumed; with ``kind``, whether its state is of that."""
     try:
         manifest = checkpoint_folder(output).manifest()
     except (OSError, InputError):
         return False
-    return manifest is not None and bool(manifest.state)
+    if manifest is None or not manifest.state:
+        return False
+    return kind is None or manifest.schema == schema(kind)
