@@ -17,6 +17,7 @@ from geogs_bench.catalogue.paper_tables import PAPER_TABLES, PAPER_TABLES_SMALL,
 from geogs_bench.harness import Harness
 from geogs_bench.plan import Selection
 from geogs_bench.runners.runner import Runner
+from geogs_bench.scoring.room_scores import TrueSurface, read_true_surface
 from io_samples import write_images
 from posed_layouts import write_colmap_text, write_dtu, write_scannet
 
@@ -47,6 +48,15 @@ def stand_ins(monkeypatch, small_room) -> list[str]:
             shutil.copytree(small_room, folder / cell.name)
         return folder
 
+    known: dict[tuple, TrueSurface | None] = {}
+
+    def surface_once(truth, camera, T_cw) -> TrueSurface | None:
+        key = truth.surface.read_bytes(), truth.culling, camera, T_cw.tobytes()
+        if key not in known:
+            known[key] = read_true_surface(truth, camera, T_cw)
+        return known[key]
+
+    monkeypatch.setattr("geogs_bench.scoring.slam_scores.read_true_surface", surface_once)
     monkeypatch.setattr("geogs_bench.bench.render_cells", render)
     monkeypatch.setattr("geogs_bench.scoring.scores.draw", lambda *_: None)
     return asked
