@@ -8,8 +8,8 @@ RoomMotionKind = Literal[
 ]  # fmt: skip
 """Motions through a room."""
 ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
-MotionKind = Literal[RoomMotionKind, "dining", "driving", "corridor"]
-"""Motions through a room, around a table in a room of thin things, along a street, or along a
-corridor almost without texture."""
+MotionKind = Literal[RoomMotionKind, "dining", "driving", "corridor", "white-panel", "weak-link"]
+"""Motions through a room, around a table in a room of thin things, along a street, along a corridor
+almost without texture, or past a white panel that leaves a margin of texture or none."""
 LampKind = Literal["steady", "switched"]
 """Constant lamps, or other lamps in each third of the sequence."""

@@ -10,6 +10,7 @@ from geogs_synth.motion.room_motions import Motion, room_motion
 from geogs_synth.places.corridor import make_corridor, walk
 from geogs_synth.places.dining_room import make_dining_room
 from geogs_synth.places.moving_bodies import crossing_walkers, street_traffic
+from geogs_synth.places.panelled_wall import make_panelled_wall, walk_past
 from geogs_synth.places.room import make_room
 from geogs_synth.places.street import drive, make_street
 from geogs_synth.scene.bodies import Body
@@ -17,6 +18,8 @@ from geogs_synth.scene.textured_scene import Scene
 
 ROOM_FOCAL = 0.7
 """Focal length over the longer side of the image in rooms: 71 degrees across."""
+PANELS: dict[MotionKind, float] = {"white-panel": 1.7, "weak-link": 2.1}
+"""Width of the white panels, metres: the camera sees 2.3 m."""
 STREET_FOCAL = 0.58
 """The same on streets: 82 degrees across."""
 
@@ -47,6 +50,7 @@ class Location:
     def name(self) -> str:
         """The place and its seed."""
         places = {"driving": "street", "corridor": "corridor", "dining": "dining room"}
+        places |= dict.fromkeys(PANELS, "panelled wall")
         return f"procedural {places.get(self.kind, 'room')}, seed {self.seed}"
 
     def camera(self, width: int | None, height: int | None) -> Camera:
@@ -74,6 +78,8 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
     if kind == "corridor":
         motion = walk(scene, seed)
         return Location(kind, seed, scene, motion, depth_scale=2000.0, voxel_cm=2, reach=15.0)
+    if kind == "white-panel" or kind == "weak-link":
+        return Location(kind, seed, scene, walk_past(seed))
     motion = room_motion("handheld" if kind == "dining" else kind, scene, seed)
     return Location(kind, seed, scene, motion)
 
@@ -84,6 +90,8 @@ def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
         return make_street(seed)
     if kind == "dining":
         return make_dining_room(seed)
+    if kind in PANELS:
+        return make_panelled_wall(PANELS[kind], seed)
     return make_corridor(seed) if kind == "corridor" else make_room(seed)
 
 
