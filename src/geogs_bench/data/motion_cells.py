@@ -47,7 +47,9 @@ def relighted(cell: Cell) -> Cell:
     return replace(cell, name=f"{cell.name}-light", flaws=flaws, lamps="switched")
 
 
-PLACES: tuple[MotionKind, ...] = ("handheld", "dining", "driving", "corridor")
+PLACES: tuple[MotionKind, ...] = (
+    "handheld", "dining", "driving", "corridor", "white-panel", "weak-link",
+)  # fmt: skip
 """One motion for each kind of scene."""
 
 
@@ -91,6 +93,7 @@ SMALL: tuple[Cell, ...] = (
     _cell("still", "kinect", 30, _QVGA),
     _cell("driving", "clean", 60, (496, 150)),
     _cell("corridor", "kinect", 60, _QVGA),
+    *(_cell(motion, "phone", 64, _QVGA) for motion in ("white-panel", "weak-link")),
 )
 """Cells for two CPU cores."""
 
@@ -114,7 +117,11 @@ FULL: tuple[Cell, ...] = (
     _cell("driving", "clean", 125, _STREET),
     _cell("driving", "action", 125, _STREET),
     _cell("driving", "clean", 125, _STREET, 0.15),
-    *(_cell("corridor", camera, 120, _LARGER) for camera in ("clean", "phone", "kinect")),
+    *(
+        _cell(motion, camera, frames, _LARGER)
+        for motion, frames in (("corridor", 120), ("white-panel", 64), ("weak-link", 64))
+        for camera in ("clean", "phone", "kinect")
+    ),
 )
 """All motions, all flaws."""
 

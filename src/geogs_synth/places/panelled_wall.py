@@ -22,8 +22,9 @@ _SPEED, _RATE = 0.9, 15.0
 _TEXEL = 0.004
 
 
-def make_panelled_wall(panel: float, seed: int = 0) -> Scene:
-    """A wall with a white panel of ``panel`` metres; the same seed always gives the same wall."""
+def make_panelled_wall(panel: float, board: float, seed: int = 0) -> Scene:
+    """A wall with a white panel of ``panel`` metres, of boards that are ``board`` metres wide; the
+    same seed always gives the same wall."""
     rng = np.random.default_rng([seed, 0x9A11])
     length, depth, height = _SIZE
     build = SceneBuilder(rng)
@@ -32,7 +33,9 @@ def make_panelled_wall(panel: float, seed: int = 0) -> Scene:
     colour = patterns.random_colour(rng, (0.1, 0.4), (0.5, 0.8))
     ground = wall.texture(patterns.plaster(rng, shape, colour))
     wall.rectangle((0, 0, height / 2), (length, height), ground, FACING_Y)
-    white = patterns.panels(rng, (700, round(panel / _TEXEL)), (350, 1e6), (214, 214, 210), 0.1)
+    white = patterns.panels(
+        rng, (700, round(panel / _TEXEL)), (350.0, board / _TEXEL), (214, 214, 210), 0.1
+    )
     wall.box((0, 0.01, height / 2), (panel, 0.02, height), wall.texture(white))
     for side in (-1, 1):
         _pictures(wall, rng, side, panel / 2)

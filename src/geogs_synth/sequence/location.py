@@ -18,8 +18,11 @@ from geogs_synth.scene.textured_scene import Scene
 
 ROOM_FOCAL = 0.7
 """Focal length over the longer side of the image in rooms: 71 degrees across."""
-PANELS: dict[MotionKind, float] = {"white-panel": 1.7, "weak-link": 2.1}
-"""Width of the white panels, metres: the camera sees 2.3 m."""
+PANELS: dict[MotionKind, tuple[float, float]] = {
+    "white-panel": (1.7, 2.0),
+    "weak-link": (2.6, 0.12),
+}
+"""Width of the white panels and of their boards, metres: the camera sees 2.3 m."""
 STREET_FOCAL = 0.58
 """The same on streets: 82 degrees across."""
 
@@ -91,7 +94,7 @@ def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
     if kind == "dining":
         return make_dining_room(seed)
     if kind in PANELS:
-        return make_panelled_wall(PANELS[kind], seed)
+        return make_panelled_wall(*PANELS[kind], seed)
     return make_corridor(seed) if kind == "corridor" else make_room(seed)
 
 
