@@ -45,10 +45,7 @@ def best_residuals(
 
     Returns 0 where there is no match.
     """
-    if not camera.is_pinhole:  # convert to a pinhole
-        plane = camera.plane(pixels)
-        focal = pixels.new_tensor([camera.fx, camera.fy])
-        pixels = plane * focal + pixels.new_tensor([camera.cx, camera.cy])
+    pixels = camera.as_pinhole(pixels)
     if inverse_depth.is_cuda:
         from geogs.bundle.cuda import rigidity
 

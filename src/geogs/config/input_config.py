@@ -27,8 +27,8 @@ class InputConfig(Settings, group="input"):
             }
         ),
     ] = "auto"
-    """Field of view of straight images, of which the map is made, not of the lens: degrees along the
-    longer side; auto keeps all that fits without a border, and of a fisheye at most 90."""
+    """Field of view of the straight images of which the map is made, not of the lens: degrees along
+    the longer side; auto keeps all that fits without a border, and of a fisheye at most 90."""
     readout: Annotated[float | Literal["auto"], Range(-0.1, 0.1), Only("run")] = "auto"
     """Seconds a rolling shutter takes from the first to the last row as the sensor reads them, such
     as 0.0276; 0 for a global shutter, auto finds it in the video."""

@@ -15,10 +15,6 @@ LEAST_SLOPE = 0.1
 """Least slope of the distorted radius; below it the image folds over."""
 FISHEYE_LIMIT = math.radians(88.0)
 """Angle from the axis up to which the plane z = 1 is used; rays beyond are clamped to it."""
-_CENTRAL = 1e-4
-"""Squared distance from the axis below which a fisheye's growth has the slope of the axis."""
-_RADIAL_STEPS, _PLANE_STEPS = 8, 6
-"""Newton steps to undistort: along the radius, and then with tangential terms in the plane."""
 
 
 @dataclass(frozen=True)
@@ -178,8 +174,6 @@ class Camera:
         """Return the growth, and its derivatives by k1 and k2."""
         if not self.is_fisheye:
             over = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
-            if not (self.k4 or self.k5 or self.k6):
-                return over, square, square.square()
             under = 1 + square * (self.k4 + square * (self.k5 + square * self.k6))
             return over / under, square / under, square.square() / under
         angle, bend = self._angle(square)
@@ -192,14 +186,12 @@ class Camera:
         """Return twice the derivative of the growth by r^2."""
         if not self.is_fisheye:
             over = 2 * self.k1 + square * (4 * self.k2 + 6 * square * self.k3)
-            if not (self.k4 or self.k5 or self.k6):
-                return over
             under = 1 + square * (self.k4 + square * (self.k5 + square * self.k6))
             more = 2 * self.k4 + square * (4 * self.k5 + 6 * square * self.k6)
             return (over - more * self.growth(square)) / under
         slope = self._angle_slope(square) / (1 + square)
-        outer = (slope - self.growth(square)) / square.clamp(min=_CENTRAL)
-        return torch.where(square > _CENTRAL, outer, 2 * self.k1 - 2 / 3)
+        outer = (slope - self.growth(square)) / square.clamp(min=1e-4)
+        return torch.where(square > 1e-4, outer, 2 * self.k1 - 2 / 3)  # to rounding at the axis
 
     def steepness(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return the slope of the distorted radius, by the radius or the angle of a fisheye; the
@@ -247,7 +239,7 @@ class Camera:
         widest = self._widest_angle
         if self.is_fisheye:
             angle = radius.clamp(max=widest)
-            for _ in range(2 * _RADIAL_STEPS):
+            for _ in range(16):
                 square = angle.tan().square()
                 over = angle * self._angle(square)[1] - radius
                 step = over / self._angle_slope(square).clamp(min=LEAST_SLOPE)
@@ -255,12 +247,12 @@ class Camera:
             return torch.where(radius > 0, bent * (angle.tan() / radius.clamp(min=1e-30)), bent)
         farthest = math.tan(widest)
         s = radius.clamp(max=farthest)
-        for _ in range(_RADIAL_STEPS):
+        for _ in range(8):
             square = s.square()
             slope = self.steepness(square).clamp(min=LEAST_SLOPE)
             s = (s - (s * self.growth(square) - radius) / slope).clamp(0.0, farthest)
         plane = torch.where(radius > 0, bent * (s / radius.clamp(min=1e-30)), bent)
-        for _ in range(_PLANE_STEPS if self.p1 or self.p2 else 0):
+        for _ in range(8 if self.p1 or self.p2 else 0):
             step = self.unbent_step(plane, bent - self.bent(plane))
             plane = plane + torch.where(self.shows(plane)[..., None], step.clamp(-1.0, 1.0), 0.0)
         return plane

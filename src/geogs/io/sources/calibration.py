@@ -152,14 +152,10 @@ class Calibration:
 
     def camera(self) -> Camera:
         """The camera of its images, with the distortion. The size must be known."""
-        terms = (*self.distortion, *8 * (0.0,))[:8]
-        if self.lens == "fisheye":
-            k1, k2, k3, k4, *_ = terms
-            rest = {"k1": k1, "k2": k2, "k3": k3, "k4": k4}
-        else:
-            rest = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), terms, strict=True))
-        width, height = self._size()
         is_fisheye = self.lens == "fisheye"
+        order = "k1 k2 k3 k4" if is_fisheye else "k1 k2 p1 p2 k3 k4 k5 k6"
+        rest = dict(zip(order.split(), self.distortion, strict=False))
+        width, height = self._size()
         return Camera(
             self.fx, self.fy, self.cx, self.cy, width, height, is_fisheye=is_fisheye, **rest
         )
