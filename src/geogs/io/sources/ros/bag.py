@@ -133,17 +133,21 @@ def _opened(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
 
         from geogs.io.sources.ros.database import Recording
+        from geogs.io.sources.ros.decompression import bound_decompression
     except ImportError as error:
         raise InputError(
             f"{path} is a recording of ROS, which needs rosbags: {install_command('ros')}"
         ) from error
     _require_files(path)
+    bound_decompression()
     try:
         # The image types are the same in all of ROS 2, whose older bags do not describe them.
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         if bag.is2:
             bag.readers = [Recording(path)]
         bag.open()
+    except GeogsError:
+        raise
     except Exception as error:  # errors of its own, of SQLite, of YAML, of a damaged file
         raise InputError(
             f"{path} cannot be opened as a recording of ROS; is it complete and closed?"
