@@ -36,6 +36,7 @@ def test_a_run_keeps_its_surfaces_and_ends_with_the_adjustment(room, tmp_path):
     assert surface["precision_ratio"] > 65.0
 
 
+@pytest.mark.long
 def test_known_poses_keep_their_surfaces(small_room, tmp_path):
     done(
         "reconstruct", small_room, "--preset", "paper", "--stride", 5, "-o", tmp_path,

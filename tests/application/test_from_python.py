@@ -150,6 +150,7 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
 
 
 @pytest.mark.usefixtures("no_report")
+@pytest.mark.long
 def test_a_reconstruction_is_that_of_the_command_and_writes_nothing(
     small_room, tmp_path, capfd, monkeypatch
 ):
@@ -170,6 +171,7 @@ def test_a_reconstruction_is_that_of_the_command_and_writes_nothing(
     require_same(tmp_path / "own", tmp_path / "out")
 
 
+@pytest.mark.long
 def test_a_run_in_one_call_is_that_of_the_command_too(small_room, tmp_path, capfd, no_report):
     result = geogs.run(small_room, run_config(), tmp_path / "out", "cpu")
     assert capfd.readouterr() == ("", "")

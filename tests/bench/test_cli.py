@@ -27,6 +27,7 @@ def room(small_room, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_benchmark_runs_scores_and_resumes(room, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("geogs.evaluation.pages.shading._WIDTH", 120)
     output = tmp_path / "out"

@@ -38,7 +38,7 @@ def test_cells_have_names_of_their_own() -> None:
         names = [cell.name for cell in cells]
         assert len(set(names)) == len(names)
     assert {cell.motion for cell in FULL} == {cell.motion for cell in FULL + SMALL}
-    assert len({cell.motion for cell in FULL}) == 14
+    assert len({cell.motion for cell in FULL}) == 16
     assert sum(cell.frames * cell.width * cell.height for cell in SMALL) < 1000 * 320 * 240
 
 

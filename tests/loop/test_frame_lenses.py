@@ -122,7 +122,7 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     assert lens.varies_focal == pytest.approx(focal / 2**0.5, rel=0.3)
     assert lens.varies_centre == pytest.approx(centre, rel=0.3)  # what stays has nothing of its own
     view = StraightView(CAMERA, CAMERA, lens).of_frame(own[7])
-    assert np.array_equal(tracker.keyframes[7].image, view.image(image_of(7)))
+    assert np.array_equal(tracker.keyframes[7].straight_image, view.image(image_of(7)))
     shown = SceneMask().of(tracker.keyframes[7])
     assert shown is None or np.array_equal(shown, view.is_seen)
 

@@ -143,7 +143,7 @@ def test_the_end_of_tracking_straightens_images_once():
     assert lens is not None
     assert (lens.k1, lens.k2) == pytest.approx(BEND, rel=0.1)
     assert 0 < lens.deviation_k1 < 0.02
-    straight = tracker.keyframes[3].image
+    straight = tracker.keyframes[3].straight_image
     assert np.array_equal(straight, StraightView(CAMERA, CAMERA, lens).image(image_of(3)))
     assert centre_error(tracker, truth) < 1.1 * by_a_lens
     wanted = tracker.map.graph.operator.d
@@ -152,7 +152,7 @@ def test_the_end_of_tracking_straightens_images_once():
         factor = (keyframe.inverse_depth / wanted[keyframe.id])[known]
         assert float((factor / factor.median() - 1).abs().quantile(0.9)) < 0.02
     assert not global_bundle(tracker, ends=True).after
-    assert tracker.keyframes[3].image is straight
+    assert tracker.keyframes[3].straight_image is straight
 
 
 @pytest.mark.system
@@ -232,7 +232,7 @@ def test_a_principal_point_is_found_where_nobody_told_of_the_lens():
     assert (lens.right, lens.down) == pytest.approx(centre, abs=0.006)
     assert 0 < lens.deviation_centre < 0.02
     assert lens.focal == pytest.approx(1 / 1.03, abs=0.012)
-    straight = tracker.keyframes[3].image
+    straight = tracker.keyframes[3].straight_image
     assert np.array_equal(straight, StraightView(CAMERA, CAMERA, lens).image(image_of(3)))
 
 

@@ -31,6 +31,7 @@ def errors(room: Path) -> np.ndarray:
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_lost_frames_stand_to_the_room_and_not_to_people(tmp_path):
     pytest.importorskip("pycolmap")
     assert errors(tmp_path).max() < 0.03

@@ -170,6 +170,7 @@ def test_a_reconstruction_of_nothing_stays_nothing():
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_each_way_places_a_room(monkeypatch):
     """Incremental mapping is taken to have failed; the others place all by themselves."""
     pytest.importorskip("pycolmap")

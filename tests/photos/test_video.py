@@ -82,6 +82,7 @@ def test_deviations_hold_what_the_truth_is_off():
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_a_focal_length_that_contradicts_the_one_the_video_told_leaves_all_unknown():
     pytest.importorskip("pycolmap")
     room = render_room(9, 3, 240, 180)
@@ -106,6 +107,7 @@ def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("last", "is_known"), [pytest.param(1.0, True, marks=pytest.mark.long), (1.5, False)]
 )
+@pytest.mark.long
 def test_frames_of_a_zoom_have_no_place_that_counts(last, is_known):
     pytest.importorskip("pycolmap")
     room = render_room(14, 3, 240, 180)

@@ -267,6 +267,7 @@ def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
     assert error_cm(culled.trajectory().T_wc[:, :3, 3], truth) < 0.4
 
 
+@pytest.mark.long
 def test_keyframes_by_mean_flow_are_as_far_apart_as_asked_for():
     """DROID-SLAM's: a mean motion of 0.031 makes one; one within 0.052 is removed again."""
     path = sideways(45, 0.04)

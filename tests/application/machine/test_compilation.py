@@ -40,6 +40,7 @@ print(used() - rehearsed)
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_a_run_uses_nothing_that_the_rehearsal_did_not_compile(small_room, tmp_path):
     # First all is kept: a kernel that is compiled counts with its parts, one from the disk alone.
     subprocess.run([sys.executable, "-m", compilation.__name__], stdout=subprocess.DEVNULL)

@@ -49,6 +49,7 @@ def extent(T_wc: np.ndarray) -> float:
     return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
 
 
+@pytest.mark.long
 def test_measured_depth_makes_metres(small_room, tmp_path, no_report):
     result = run(
         RunSettings((small_room,), quick("sensor"), tmp_path / "out", "cpu", scale_from="sensor")

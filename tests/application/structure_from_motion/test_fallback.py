@@ -212,6 +212,7 @@ def test_placed_frames_are_taken_where_they_are_better(ended, tmp_path, monkeypa
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     ended, tmp_path, monkeypatch, capfd
 ):
@@ -237,6 +238,7 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
 
 @pytest.mark.system
 @pytest.mark.usefixtures("_lost", "no_report")
+@pytest.mark.long
 def test_frames_that_are_found_about_the_keyframes_have_a_place(tmp_path, monkeypatch):
     command = write_video(tmp_path / "video")
     write_image(tmp_path / "video" / "009.png", np.zeros_like(filmed().images[9]))

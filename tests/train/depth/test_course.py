@@ -38,6 +38,7 @@ class OneBatch(DepthCourse):
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_one_batch_is_learnt_by_heart():
     options = replace(TRAINING, steps=50, learning_rate=3e-3, warmup=5)
     course = OneBatch(options, CPU)
