@@ -117,9 +117,10 @@ FULL: tuple[Cell, ...] = (
     _cell("driving", "clean", 125, _STREET),
     _cell("driving", "action", 125, _STREET),
     _cell("driving", "clean", 125, _STREET, 0.15),
+    *(_cell("corridor", camera, 120, _LARGER) for camera in ("clean", "phone", "kinect")),
     *(
-        _cell(motion, camera, frames, _LARGER)
-        for motion, frames in (("corridor", 120), ("white-panel", 64), ("weak-link", 64))
+        _cell(motion, camera, 64, _LARGER)
+        for motion in ("white-panel", "weak-link")
         for camera in ("clean", "phone", "kinect")
     ),
 )
