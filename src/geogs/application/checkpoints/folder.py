@@ -82,7 +82,7 @@ def _new_key() -> bytes | None:
     return _key()
 
 
-FORMAT = "geogs checkpoint 2"
+FORMAT = "geogs checkpoint 3"
 MANIFEST = "manifest.json"
 _UNFINISHED = ".manifest.json.part"
 _OUR_NAME = re.compile(r"state-\d{1,18}\.(json|safetensors)|archive-[0-9a-f]{16}")
