@@ -12,7 +12,7 @@ from bag_samples import BagWriter
 from geogs.errors import InputError
 from geogs.io.sources.ros import decompression
 from geogs.io.sources.ros.bag import Bag
-from geogs.io.sources.ros.decompression import _zstd, bounded
+from geogs.io.sources.ros.decompression import TooLarge, _zstd, bounded
 
 COMPRESSORS = {
     "zstd": (_zstd.compress, _zstd.ZstdDecompressor),
@@ -30,10 +30,12 @@ def test_frames_are_unpacked_one_after_the_other_up_to_a_bound(name, monkeypatch
     first, second = bytes(3000), np.random.default_rng(0).bytes(2000)
     assert unpack(compress(first) + compress(second), 5000) == first + second
     for data, said in [(bytes(5001), 0), (bytes(10_000_000), 0), (b"a", 5001)]:
-        with pytest.raises(InputError, match="unpacks to more than"):
+        with pytest.raises(TooLarge, match="unpacks to more than"):
             unpack(compress(data), said)
-    with pytest.raises(InputError, match="unpacks to more than"):
+    with pytest.raises(TooLarge, match="unpacks to more than"):
         unpack(compress(first) + compress(first))
+    with pytest.raises(TooLarge, match="more than 1000"):
+        unpack(20_000 * compress(b""))
     with pytest.raises(ValueError, match="cut off"):
         unpack(compress(second)[:-4])
 
@@ -59,7 +61,7 @@ def test_a_compressed_bag_is_read_and_one_that_becomes_too_large_is_not(tmp_path
     assert [int(image[0, 0, 0]) for image in images] == [0, 40, 80, 120, 160]
     monkeypatch.setattr(decompression, "MOST", 9000)
     monkeypatch.setattr(decompression.shutil, "disk_usage", lambda _: _Disk)
-    with pytest.raises(InputError, match="unpacks to more than"):
+    with pytest.raises(InputError, match=f"{path.name}: .* unpacks to more than"):
         list(Bag(path).read(0, None, 1))
 
 

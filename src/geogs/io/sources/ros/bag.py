@@ -133,7 +133,7 @@ def _opened(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
 
         from geogs.io.sources.ros.database import Recording
-        from geogs.io.sources.ros.decompression import bound_decompression
+        from geogs.io.sources.ros.decompression import TooLarge, bound_decompression
     except ImportError as error:
         raise InputError(
             f"{path} is a recording of ROS, which needs rosbags: {install_command('ros')}"
@@ -146,8 +146,8 @@ def _opened(path: Path) -> Iterator[Any]:
         if bag.is2:
             bag.readers = [Recording(path)]
         bag.open()
-    except GeogsError:
-        raise
+    except TooLarge as error:
+        raise InputError(f"{path}: {error}; leave it out.") from None
     except Exception as error:  # errors of its own, of SQLite, of YAML, of a damaged file
         raise InputError(
             f"{path} cannot be opened as a recording of ROS; is it complete and closed?"
@@ -156,6 +156,8 @@ def _opened(path: Path) -> Iterator[Any]:
         yield bag
     except (GeogsError, MemoryError):
         raise
+    except TooLarge as error:
+        raise InputError(f"{path}: {error}; leave it out.") from None
     except Exception as error:  # a damaged index may fail later, too
         raise InputError(f"{path} is damaged as a recording of ROS; copy it again.") from error
     finally:

@@ -16,23 +16,30 @@ from rosbags.rosbag1 import reader as ros1
 from rosbags.rosbag2 import reader as ros2
 from rosbags.rosbag2 import storage_mcap
 
-from geogs.errors import InputError
-
 MOST = 1 << 28
 """Bytes of the largest chunk or message; an image of 8K with three times 16 bits has 200 MB."""
+_FRAMES = 1000
+"""Most frames of a part: that of a parallel bzip2 has one for every 900 kB."""
 _zstd = ros2.zstd
+
+
+class TooLarge(ValueError):
+    """What a part unpacks to exceeds a bound."""
 
 
 def bounded(new: Callable[[], Any]) -> Callable[..., bytes]:
     """Return a function that unpacks data, each of its frames by a new decompressor.
 
-    It raises InputError where there are, or are said to be, more than ``MOST`` bytes.
+    It raises TooLarge where there are, or are said to be, more than ``MOST`` bytes, or too many
+    frames.
     """
 
     def decompress(data: bytes, size: int = 0) -> bytes:
         parts = list[bytes]()
         left = MOST if size <= MOST else -1
         while data and left >= 0:
+            if len(parts) == _FRAMES:
+                raise TooLarge(f"a part of it has more than {_FRAMES} compressed frames")
             frame = new()
             parts.append(frame.decompress(data, max_length=left + 1))
             left -= len(parts[-1])
@@ -40,9 +47,7 @@ def bounded(new: Callable[[], Any]) -> Callable[..., bytes]:
                 raise ValueError("the compressed data are cut off")
             data = frame.unused_data
         if left < 0:
-            raise InputError(
-                f"A part of the bag unpacks to more than {MOST >> 20} MB; leave it out."
-            )
+            raise TooLarge(f"a part of it unpacks to more than {MOST >> 20} MB")
         return b"".join(parts)
 
     return decompress
@@ -59,7 +64,7 @@ def _opened(file: BinaryIO, mode: Literal["rb"]) -> Iterator[Any]:
             data: bytes = inner.read(count)
             left -= len(data)
             if left < 0:
-                raise InputError("A file of the bag unpacks to more than the disk can hold.")
+                raise TooLarge("a file of it unpacks to more than half of the free disk")
             return data
 
         yield SimpleNamespace(read=read)
